@@ -145,6 +145,14 @@ def test_what_was_computed_is_not_again_where_workers_are_restarted(
     assert (tmp_path / "notes").read_text() == "computed\n"
 
 
+def before_detection(whole: Path, root: Path) -> Path:
+    """A copy of the run of which only detection onward is to be done."""
+    shutil.copytree(whole, root)
+    for stage in ("detections", "tracklets", "tracks", "field", "maps"):
+        shutil.rmtree(root / "commits" / stage)
+    return root
+
+
 def one_that_kills_its_worker(plan: object, frames: range) -> object:
     """In place of the step: the first worker that gets frame 8 dies of it."""
     from velfield.pipeline.stages.detections import detect_block
@@ -159,11 +167,7 @@ def one_that_kills_its_worker(plan: object, frames: range) -> object:
 def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only detection onward is done: all before it is taken from the whole run."""
-    root = tmp_path / "run"
-    shutil.copytree(whole[0], root)
-    for stage in ("detections", "tracklets", "tracks", "field", "maps"):
-        shutil.rmtree(root / "commits" / stage)
+    root = before_detection(whole[0], tmp_path / "run")
     asked = {"cluster_class": "distributed.LocalCluster", "workers": 2}
     asked["cluster_kwargs"] = {"n_workers": 0, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
     (tmp_path / "cluster.yaml").write_text(yaml.safe_dump(ClusterFile.model_validate(asked).model_dump()))
@@ -193,10 +197,7 @@ def one_that_needs_too_much_memory(plan: object, frames: range) -> object:
 def test_a_unit_over_the_memory_limit_is_tried_once_more_and_then_left_out_with_the_reason(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = tmp_path / "run"
-    shutil.copytree(whole[0], root)
-    for stage in ("detections", "tracklets", "tracks", "field", "maps"):
-        shutil.rmtree(root / "commits" / stage)
+    root = before_detection(whole[0], tmp_path / "run")
     here = {"n_workers": 0, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "memory_limit": "1200MB"}
     runner = RunnerConfig(cluster_class="distributed.LocalCluster", workers=2, cluster_kwargs=here)
     monkeypatch.setattr("velfield.pipeline.stages.detections.detect_block", one_that_needs_too_much_memory)

@@ -181,9 +181,9 @@ def test_the_graphs_compute_what_the_bare_functions_do(
 
 
 def test_kernels_are_loaded_before_they_are_called() -> None:
-    module = "import numpy as np; from velfield.registration import mesh as module; "
-    call = "module.weighted_squares(np.ones(3), np.ones((3, 2)))"
-    signatures = "module.weighted_squares.signatures"
+    module = "import numpy as np; from velfield.registration import kernels as module; "
+    call = "module.mesh_displacement(np.ones((3, 2)), np.ones((2, 2, 2)), 8)"
+    signatures = "module.mesh_displacement.signatures"
     assert run_python(module + call) == ""  # compiled, and so cached
     loaded = f"from velfield.pipeline.stage import load_kernels; assert not {signatures}; assert load_kernels() > 0; "
     assert run_python(f"{module}{loaded}assert {signatures}") == ""

@@ -204,23 +204,6 @@ def test_an_indefinite_matrix_has_no_step(problem: dict[str, np.ndarray]) -> Non
         assert np.isnan(fit_kernels.solve_steps(*arguments, True)).all()
 
 
-def test_weights_and_scale_are_those_of_numpy() -> None:
-    rng = np.random.default_rng(8)
-    residuals, sigma = rng.normal(size=(100, 2)), rng.uniform(0.1, 1.0, 100)
-    residuals[:2] = [[np.nan, 1.0], [np.inf, 1.0]]
-    size = np.linalg.norm(residuals, axis=1) / sigma
-    assert fit_kernels.median_size(residuals, sigma) == pytest.approx(np.median(size[np.isfinite(size)]))
-    expected = np.nan_to_num(1 / (1 + (size / 2.5) ** 2) ** 2)
-    np.testing.assert_allclose(fit_kernels.geman_mcclure(residuals, sigma, 2.5), expected, atol=1e-15)
-    assert np.isnan(fit_kernels.median_size(residuals[:2], sigma))
-
-
-def test_only_points_of_weight_must_be_finite() -> None:
-    residuals = np.array([[1.0, 2.0], [np.nan, 0.0], [3.0, np.inf]])
-    assert fit_kernels.are_finite(residuals, np.array([1.0, 0.0, 0.0]))
-    assert not fit_kernels.are_finite(residuals, np.array([1.0, 0.0, 0.5]))
-
-
 def test_spline_basis_is_the_uniform_cubic_b_spline() -> None:
     rows = np.linspace(0, HEIGHT - 1, 77)
     first, weights = kernels.spline_basis(rows, HEIGHT, KNOTS)

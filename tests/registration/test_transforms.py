@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.flight import RegistrationConfig
-from velfield.camera.lens import DivisionLens, HarrisLens, Lens, PolynomialLens
-from velfield.registration import kernels
+from velfield.camera.lens import DivisionLens, HarrisLens, PolynomialLens
 from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,
@@ -68,12 +67,6 @@ def frame_transform(rng: np.random.Generator, *, mesh: bool = True) -> FrameTran
     )
 
 
-def solve(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Cramer's rule: numpy's `solve` raises if a single matrix is singular."""
-    (a, b), (c, d), (x, y) = jacobian[:, 0].T, jacobian[:, 1].T, residual.T
-    return np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
-
-
 def test_rational_is_the_plain_formula() -> None:
     p = bent(np.random.default_rng(0))
     xy = grid()
@@ -109,41 +102,10 @@ def test_polyprojective_inverse_undoes_it(seed: int) -> None:
     np.testing.assert_allclose(p.inverse(p(grid())), grid(), atol=1e-3)
 
 
-def test_polyprojective_inverse_is_newtons_method() -> None:
-    p = bent(np.random.default_rng(7))
-    target = np.concatenate([p(grid()), [[1e7, 1e7], [np.nan, 3.0]]])
-    guess = HomographyTransform(p.homography()).inverse(target)
-    for _ in range(25):
-        residual = target - p(guess)
-        if np.nanmax(np.abs(residual)) < 1e-5:
-            break
-        with np.errstate(invalid="ignore"):
-            guess = guess + solve(p.jacobian(guess), residual)
-    failed = ~(np.abs(target - p(guess)).max(axis=1) < 1e-3)
-    assert 2 <= failed.sum() < 10
-    np.testing.assert_allclose(p.inverse(target), np.where(failed[:, None], np.nan, guess), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: type(lens).__name__)
-def test_to_raw_is_newtons_method(lens: Lens) -> None:
-    t = replace(frame_transform(np.random.default_rng(8)), lens=lens)
-    target = np.concatenate([t.to_base(grid(inset=-90)), [[1e7, 1e7], [np.nan, 3.0]]])
-    raw = t.to_raw_roughly(target)
-    for _ in range(25):
-        residual = target - t.to_base(raw)
-        far = np.abs(residual).max(axis=1) > 1e-5
-        steps = [(t.to_base(raw[far] + 0.25 * unit) - t.to_base(raw[far])) / 0.25 for unit in np.eye(2)]
-        raw[far] += solve(np.stack(steps, axis=2), residual[far])
-    outside = ~((raw >= -64) & (raw <= np.array([WIDTH, HEIGHT]) + 64)).all(axis=1)
-    raw[outside | ~(np.abs(target - t.to_base(raw)).max(axis=1) < 1e-3)] = np.nan
-    assert 10 < np.isnan(raw[:, 0]).sum() < 100
-    np.testing.assert_allclose(t.to_raw(target), raw, rtol=0, atol=1e-9)
-
-
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 10_000))
 def test_to_raw_undoes_to_base_below_a_thousandth_of_a_pixel(seed: int) -> None:
-    t = frame_transform(np.random.default_rng(seed))
+    t = replace(frame_transform(np.random.default_rng(seed)), lens=LENSES[seed % len(LENSES)])
     raw = grid(31, 23)
     back = t.to_raw(t.to_base(raw))
     assert np.isfinite(back).all()
@@ -168,21 +130,6 @@ def test_to_raw_is_nan_far_outside_the_frame() -> None:
     far = t.to_base(np.array([[320.0, 240.0]])) + np.array([1e5, 1e5])
     assert np.isnan(t.to_raw(far)).all()
     assert np.isnan(t.to_base(np.array([[np.nan, 1.0]]))).all()
-
-
-def test_spline_of_equal_coefficients_is_constant() -> None:
-    first, weights = kernels.spline_basis(np.linspace(-50, HEIGHT + 50, 301), HEIGHT, 12)
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
-    assert first.min() == 0
-    assert first.max() == 12 - 4
-
-
-def test_mesh_is_bilinear_between_the_centres_of_its_cells() -> None:
-    mesh = np.arange(3 * 4 * 2, dtype=float).reshape(3, 4, 2)
-    centres = np.stack(np.meshgrid(np.arange(4) * 200 + 99.5, np.arange(3) * 200 + 99.5), axis=-1).reshape(-1, 2)
-    np.testing.assert_allclose(kernels.mesh_displacement(centres, mesh, 200), mesh.reshape(-1, 2))
-    between = np.array([[199.5, 99.5]])
-    np.testing.assert_allclose(kernels.mesh_displacement(between, mesh, 200), [(mesh[0, 0] + mesh[0, 1]) / 2])
 
 
 @pytest.mark.parametrize("model", ["row_spline", "polyprojective", "homography"])
@@ -227,18 +174,6 @@ def test_a_homography_is_the_plain_formula() -> None:
 def test_a_homography_has_no_value_beyond_its_horizon() -> None:
     h = HomographyTransform(np.array([[1.0, 0, 0], [0, 1.0, 0], [-0.01, 0, 1.0]]))  # the horizon is x = 100
     assert np.isfinite(h(np.array([[99.0, 5.0], [101.0, 5.0]]))).all(axis=1).tolist() == [True, False]
-
-
-@settings(deadline=None, max_examples=25)
-@given(st.integers(0, 10_000))
-def test_composition_is_associative(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    t, p = frame_transform(rng, mesh=False), bent(rng)
-    norm = fit_normalisation(p(t.to_base(grid(inset=40))))
-    q = PolyprojectiveTransform.from_homography(np.diag([0.7, 0.7, 1.0]), norm, norm)
-    raw = grid(inset=40)
-    np.testing.assert_array_equal(t.then(p).then(q).to_base(raw), q(t.then(p).to_base(raw)))
-    assert (t.then(p).width, t.then(p).then(q).height) == (WIDTH, HEIGHT)
 
 
 @settings(deadline=None, max_examples=25)

@@ -153,14 +153,3 @@ def test_a_map_inverted_on_a_grid_is_the_inverse() -> None:
     base = np.stack(np.meshgrid(np.arange(-40.0, 680, 16), np.arange(-40.0, 520, 16)), axis=2)
     exact = transform.to_raw(base.reshape(-1, 2)).reshape(base.shape)
     assert np.nanmax(np.abs(warp.invert_on_grid(transform, base) - exact)) < 0.005
-
-
-def test_from_cells_twice_as_large_the_map_is_the_same() -> None:
-    transform, where = wobbling(6.0), {"window": (-20, -30, 700, 500), "scale": 0.9, "shape": (450, 630)}
-    large = warp._coarse_map(transform, step=16, **where)
-    large[3, 5] = np.nan
-    from_large = warp._coarse_map(transform, step=8, twice_as_large=large, **where)
-    alone = warp._coarse_map(transform, step=8, **where)
-    assert np.nanmax(np.abs(from_large - alone)) < 0.002
-    assert np.isnan(alone).any() == np.isnan(from_large).any()
-    assert (np.isnan(from_large) == np.isnan(alone)).mean() > 0.999

@@ -4,7 +4,6 @@ The parameters are the 17 of the rational function, a border of the matrix, and 
 knot, its bands.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -219,38 +218,6 @@ def _fill_corner(sums: FloatArray, corner: FloatArray) -> None:
             corner[k, 12 + j] = corner[12 + j, k] = sums[k, 6 + j]
             corner[6 + k, 12 + j] = corner[12 + j, 6 + k] = sums[k, 12 + j]
             corner[12 + k, 12 + j] = sums[6 + k, j]
-
-
-@kernel
-def are_finite(residuals: FloatArray, weights: FloatArray) -> bool:
-    """Whether the residuals (n, 2) of positive weight (n,) are finite."""
-    for i in range(residuals.shape[0]):
-        if weights[i] > 0.0 and not (math.isfinite(residuals[i, 0]) and math.isfinite(residuals[i, 1])):
-            return False
-    return True
-
-
-@compiled(error_model="numpy")
-def median_size(residuals: FloatArray, sigma: FloatArray) -> float:
-    """Median length of the residuals (n, 2) over sigma (n,), of those that are finite; NaN without any."""
-    sizes, count = np.empty(residuals.shape[0]), 0
-    for i in range(residuals.shape[0]):
-        size = np.sqrt(residuals[i, 0] ** 2 + residuals[i, 1] ** 2) / sigma[i]
-        if math.isfinite(size):
-            sizes[count] = size
-            count += 1
-    return np.median(sizes[:count]) if count else np.nan
-
-
-@compiled(error_model="numpy")
-def geman_mcclure(residuals: FloatArray, sigma: FloatArray, unit: float) -> FloatArray:
-    """Geman-McClure weights (n,) of the length of residuals (n, 2) over sigma (n,), in this unit; 0 if not finite."""
-    weights = np.empty(residuals.shape[0])
-    for i in range(residuals.shape[0]):
-        size = np.sqrt(residuals[i, 0] ** 2 + residuals[i, 1] ** 2) / sigma[i] / unit
-        below = 1.0 + size * size
-        weights[i] = 1.0 / (below * below) if math.isfinite(size) else 0.0
-    return weights
 
 
 @kernel

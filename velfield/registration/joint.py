@@ -377,9 +377,20 @@ def _weights_and_scale(
     residuals: FloatArray, sigma: FloatArray, width: float, limit: float
 ) -> tuple[FloatArray, float]:
     """Geman-McClure weights (n,) and the robust scale (median) of the residuals over sigma."""
-    median = float(fit_kernels.median_size(residuals, sigma))
-    scale = max(min(median / 1.1774, limit) if np.isfinite(median) else limit, _MIN_SIGMA_PX)
-    return fit_kernels.geman_mcclure(residuals, sigma, width * scale), scale
+    size = np.hypot(*residuals.T) / sigma
+    scale = max(min(_median(size) / 1.1774, limit), _MIN_SIGMA_PX)
+    return geman_mcclure(size / (width * scale)), scale
+
+
+def geman_mcclure(size: FloatArray) -> FloatArray:
+    """Weights (n,) of residuals of this size; 0 of those that are not finite."""
+    return np.asarray(np.where(np.isfinite(size), 1.0 / (1.0 + size * size) ** 2, 0.0))
+
+
+def _median(size: FloatArray) -> float:
+    """Of those that are finite; infinite without any."""
+    finite = size[np.isfinite(size)]
+    return float(np.median(finite)) if len(finite) else float("inf")
 
 
 def is_inlier(weights: FloatArray) -> Mask:
@@ -389,7 +400,7 @@ def is_inlier(weights: FloatArray) -> Mask:
 
 def robust_scale(residuals: FloatArray, sigma: FloatArray) -> float:
     """Robust standard deviation per coordinate of residuals (n, 2) over sigma (n,), by their median."""
-    return max(float(fit_kernels.median_size(residuals, sigma)) / 1.1774, _MIN_SIGMA_PX)
+    return max(_median(np.hypot(*residuals.T) / sigma) / 1.1774, _MIN_SIGMA_PX)
 
 
 def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> FloatArray:
@@ -402,7 +413,7 @@ def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> Fl
     scale
         `JointFit.scale`.
     """
-    return np.asarray(fit_kernels.geman_mcclure(residuals, sigma, scale * _ANNEALING[-1]))
+    return geman_mcclure(np.hypot(*residuals.T) / (sigma * scale * _ANNEALING[-1]))
 
 
 def _irls_annealed(
@@ -511,7 +522,7 @@ def _take_step(
         return Failure(f"{len(weights)} control points do not determine the map: they lie on a line or in one place")
     for _ in range(_HALVINGS):
         stepped = problem.evaluate(state.theta + step)
-        if fit_kernels.are_finite(stepped.residuals, weights):
+        if np.isfinite(stepped.residuals[weights > 0.0]).all():
             return stepped
         step = 0.5 * step
     return state

@@ -150,12 +150,12 @@ def fit_mesh(
     equations = accumulate_bands(nodes, shares, weights, residuals, fold, FOLDS, my * mx, my + 2)
     # A fold is left out of both fits: the mesh of the others must explain the cross-validated residual.
     smoothness = smoothness_bands(mx, my)
-    squares_without = weighted_squares(weights, cv_residuals)
+    squares_without = float(weights @ (cv_residuals**2).sum(axis=1))
     best, best_squares, best_cv, mesh = None, squares_without * (1 - _MIN_GAIN), cv_residuals, None
     for stiffness in stiffnesses:
         meshes = solve_without_folds(*equations, smoothness, stiffness)
         mesh_cv = cv_residuals - interpolate_mesh(nodes, shares, meshes, fold)
-        squares = weighted_squares(weights, mesh_cv)
+        squares = float(weights @ (mesh_cv**2).sum(axis=1))
         if squares < best_squares:
             best, best_squares, best_cv, mesh = stiffness, squares, mesh_cv, meshes[FOLDS]
     if best is None or mesh is None:
@@ -184,15 +184,6 @@ def solve_without_folds(normal: FloatArray, right: FloatArray, smoothness: Float
     for f in range(folds + 1):
         meshes[f] = found[:, :, f]
     return meshes
-
-
-@kernel
-def weighted_squares(weights: FloatArray, vectors: FloatArray) -> float:
-    """Sum of the squared lengths of vectors (n, 2) by weights (n,)."""
-    total = 0.0
-    for i in range(len(weights)):
-        total += weights[i] * (vectors[i, 0] ** 2 + vectors[i, 1] ** 2)
-    return total
 
 
 @kernel
