@@ -12,6 +12,7 @@ from scipy import special
 
 from schemas.arrays import FloatArray
 from velfield.analysis.intervals import LEVEL, Estimate
+from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 
 FDR_LEVEL = 0.05
@@ -71,14 +72,20 @@ def _discoveries(p: FloatArray) -> FloatArray:
     return out
 
 
-def _junctions(before: TrafficAnalysis, after: TrafficAnalysis) -> Iterator[Quantity]:
-    """Cycles, shares, flows, travel times and speed reductions at junctions that both flights have."""
+def common_junctions(
+    before: TrafficAnalysis, after: TrafficAnalysis
+) -> Iterator[tuple[JunctionMovements, JunctionMovements]]:
+    """Junctions that both flights have."""
     for old in before.movements:
+        away = [float(np.hypot(*(new.junction.centre_m - old.junction.centre_m))) for new in after.movements]
+        if min(away, default=np.inf) < _NEAR_M:
+            yield old, after.movements[int(np.argmin(away))]
+
+
+def _junctions(before: TrafficAnalysis, after: TrafficAnalysis) -> Iterator[Quantity]:
+    """Cycles, shares, flows, travel times and delays at junctions that both flights have."""
+    for old, new in common_junctions(before, after):
         centre = old.junction.centre_m
-        near = [new for new in after.movements if np.hypot(*(new.junction.centre_m - centre)) < _NEAR_M]
-        if not near:
-            continue
-        new = min(near, key=lambda found: float(np.hypot(*(found.junction.centre_m - centre))))
         name = f"{old.junction.kind} at {centre[0]:.0f}, {centre[1]:.0f} m"
         a, b = before.signals.get(old.junction.number), after.signals.get(new.junction.number)
         yield f"cycle, {name}", "s", centre, a.cycle_s if a else None, b.cycle_s if b else None
@@ -89,6 +96,7 @@ def _junctions(before: TrafficAnalysis, after: TrafficAnalysis) -> Iterator[Quan
                 yield f"share {way}", "", centre, m.share, other.share
                 yield f"flow {way}", "veh/h", centre, m.flow_veh_per_h, other.flow_veh_per_h
                 yield f"travel time {way}", "s", centre, m.travel_time_s, other.travel_time_s
+                yield f"delay {way}", "s", centre, m.delay_s, other.delay_s
 
 
 def _roads(before: TrafficAnalysis, after: TrafficAnalysis) -> Iterator[Quantity]:

@@ -12,6 +12,7 @@ from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fiel
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.report.change import change_figure
 from velfield.report.figures import MapScale, png_bytes
+from velfield.report.traffic.before_after import before_after_html
 from velfield.run.commits import write_atomically
 from velfield.run.field_algebra import check_same_grid
 from velfield.run.frame_transforms import north_direction_rad
@@ -21,7 +22,8 @@ from velfield.viewer.record import write_change_layers
 
 
 def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_COUNT) -> list[str]:
-    """Write ``direction_change.png``, ``speed_change.png``, ``volume_change.png`` and ``change.tif`` into ``out``.
+    """Write ``direction_change.png``, ``speed_change.png``, ``volume_change.png`` and ``change.tif`` into ``out``; of
+    runs with tracks ``before_after.html`` and ``traffic_change.csv``, too.
 
     The later run's page shows the changes too.
 
@@ -57,18 +59,21 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
     return [
         *(_line(name, changes[name], *shown[name]) for name in changes),
         *_traffic_lines(runs[0], runs[1], out),
-        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures and tables in {out}",
+        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures, tables and before_after.html in {out}",
     ]
 
 
 def _traffic_lines(before: Run, after: Run, out: Path) -> list[str]:
-    """Write what differs in shares, flows, travel times, cycles and free-flow speeds; a line on each that does.
+    """Write the page and the table of what differs in shares, flows, delays, cycles and free-flow speeds.
 
-    A merged or subtracted field has no tracks to use.
+    Returns a line on each that does; none of a merged or subtracted field, which has no tracks.
     """
     if before.made_from or after.made_from:
         return []
     changes = find_changes(before.analysis.traffic, after.analysis.traffic)
+    maps = [(f"Change of {name}", f"{name}_change.png") for name in ("volume", "speed", "direction")]
+    page = before_after_html(before.analysis.traffic, after.analysis.traffic, changes, maps=maps)
+    write_atomically(out / "before_after.html", page.encode())
     rows = [
         {
             "what": c.what,

@@ -26,7 +26,10 @@ _UPSTREAM_M = 60
 _FURNESS_STEPS = 60
 _SLICE_S = 120.0
 """Counts of slices so long show how much the flow varies."""
-_MIN_PASSES = 3
+_MIN_PASSES, _MIN_DELAYED, _MIN_FREE = 3, 10, 3
+"""Fewest vehicles of a movement; of which the delay is known; and of these that do not stop."""
+_WAITS_S = 1.5
+"""A vehicle that needs longer for a metre has stopped."""
 _SPREAD_N = 8
 """The standard deviation of all travel times through a junction counts for so many of a movement's vehicles: five may
 all have come at green."""
@@ -37,7 +40,8 @@ class Passes:
     """Tracks in a junction, one row a pass: gates by number, -1 where the track was not seen to enter (or leave).
 
     ``entry_s``, ``exit_s`` and ``upstream_s`` (``_UPSTREAM_M`` before the entry) are times, NaN where unknown;
-    ``joined``: of two tracks or more of one vehicle, of which ``track`` is the one that enters (or leaves).
+    ``joined``: of two tracks or more of one vehicle, of which ``track`` is the one that enters (or leaves);
+    ``stood``: at some time between upstream and exit.
     """
 
     track: IntArray
@@ -47,6 +51,7 @@ class Passes:
     exit_s: FloatArray
     upstream_s: FloatArray
     joined: Mask
+    stood: Mask
 
 
 @dataclass(frozen=True)
@@ -129,7 +134,8 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
     inside = near[inside_hull(samples.xy_m[near], junction.hull_m)]
     if not len(inside):
         none, number = np.empty(0), np.empty(0, np.int64)
-        return Passes(number, number, number, none, none, none, np.empty(0, bool))
+        no = np.empty(0, bool)
+        return Passes(number, number, number, none, none, none, no, no)
     breaks = np.flatnonzero((np.diff(inside) > 1) | (np.diff(samples.track[inside]) != 0)) + 1
     first, last = inside[np.r_[0, breaks]], inside[np.r_[breaks - 1, len(inside) - 1]]
     enters = (first > 0) & (samples.track[np.maximum(first - 1, 0)] == samples.track[first])
@@ -139,6 +145,7 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
     gate_out = np.where(leaves, gates.nearest(samples.xy_m[last], samples.direction_rad[last], inwards=False), -1)
     up = np.maximum(first - _UPSTREAM_M, 0)
     reaches = enters & (samples.track[up] == samples.track[first])
+    waits = np.r_[0, np.cumsum(np.diff(samples.time_s) > _WAITS_S)]
     return Passes(
         samples.track[first],
         gate_in,
@@ -147,6 +154,7 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
         np.where(leaves, samples.time_s[last], np.nan),
         np.where(reaches, samples.time_s[up], np.nan),
         np.zeros(len(first), bool),
+        reaches & (waits[last] > waits[up]),
     )
 
 
@@ -231,11 +239,12 @@ def furness(seen: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
     return np.asarray(out)
 
 
-def _travel_times(passes: Passes, rows: Mask) -> tuple[FloatArray, FloatArray]:
-    """Travel times from upstream of the junction to its exit, where they are known, and when they begin."""
+def _travel_times(passes: Passes, rows: Mask) -> tuple[FloatArray, FloatArray, Mask]:
+    """Travel times from upstream of the junction to its exit, where they are known, when they begin, and whether the
+    vehicle stood on the way."""
     time = (passes.exit_s - passes.upstream_s)[rows]
     known = np.isfinite(time)
-    return time[known], passes.upstream_s[rows][known]
+    return time[known], passes.upstream_s[rows][known], passes.stood[rows][known]
 
 
 def _spread(times_s: Sequence[FloatArray]) -> tuple[float, int]:
@@ -247,18 +256,19 @@ def _spread(times_s: Sequence[FloatArray]) -> tuple[float, int]:
 
 
 def _delay(
-    time_s: FloatArray, begin_s: FloatArray, observed_s: FloatArray, spread: tuple[float, int]
+    time_s: FloatArray, begin_s: FloatArray, stood: Mask, observed_s: FloatArray, spread: tuple[float, int]
 ) -> tuple[Estimate | None, Estimate | None]:
-    """Travel time of a movement, and its delay against the fastest tenth of its vehicles."""
+    """Travel time of a movement, and its delay against the fastest tenth of its vehicles that do not stop; no delay
+    where hardly any passes without a stop."""
     # Those that take long are more often cut by the begin and the end of the time that is seen.
     seen = np.maximum(np.maximum(np.diff(observed_s, axis=1) - time_s, 0.0).sum(axis=0), 1.0)
     weight = seen.mean() / seen if len(seen) else seen
     weight = weight / weight.mean() if len(weight) else weight
     mean = float((weight * time_s).mean()) if len(time_s) else 0.0
     travel = estimate_mean(mean + weight * (time_s - mean), begin_s, spread=spread)
-    if travel is None or travel.n < 10:
+    if travel is None or travel.n < _MIN_DELAYED or np.sum(~stood) < _MIN_FREE:
         return travel, None
-    free = float(np.quantile(time_s, 0.1))
+    free = float(np.quantile(time_s[~stood], 0.1))
     return travel, Estimate(travel.value - free, max(travel.low - free, 0.0), travel.high - free, travel.n)
 
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 MAX_ROWS = 400
 """Rows of a table that are shown; the workbook and the JSON have all."""
 _WIDTH_IN, _PAGE_IN = 7.2, (8.27, 11.69)
-_DPI = 130
-_STYLE = """
+DPI = 130
+STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 1.5em auto; max-width: 58em; padding: 0 1em; color: #1b1f24 }
 h1 { line-height: 1.2; margin-bottom: 0.2em } h2 { margin: 1.6em 0 0.3em }
 .seen { font-size: 1.1em; color: #4b545d; margin: 0 0 1em }
@@ -56,7 +56,7 @@ def report_html(
     tables = "".join(_table(table) + _clips(table, clips or {}) for table in record.tables)
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Traffic analysis</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head><body>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head><body>'
         f'<h1>Traffic analysis</h1><p class="seen">{escape(_seen(record, page))}</p>{"".join(pictures[:1])}'
         f"<h2>Answers</h2><dl>{answers}</dl><p class='note'>In brackets: the 90 % interval, and n, the number of "
         f"vehicles, cycles or events that it rests on.</p>{missing}{''.join(pictures[1:])}"
@@ -75,7 +75,7 @@ def _seen(record: AnalysisRecord, page: FirstPage) -> str:
 
 
 def _picture(diagram: Diagram) -> str:
-    figure = new_figure(_WIDTH_IN, diagram.height_in, dpi=_DPI)
+    figure = new_figure(_WIDTH_IN, diagram.height_in, dpi=DPI)
     diagram.draw(figure.add_subplot())
     figure.tight_layout()
     url = f"data:image/png;base64,{b64encode(figure_bytes(figure, 'png')).decode()}"
