@@ -1,6 +1,6 @@
 """Accuracy of `velfield analyse` on simulated traffic without images: ``python -m tests.benchmarks.analysis``.
 
-Tracks are true trajectories with the errors of tracking (`velfield.synthetic.observed_tracks`).
+Tracks are true trajectories with the errors of tracking (`tests.benchmarks.observed_tracks`).
 """
 
 import argparse
@@ -14,6 +14,8 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray
 from schemas.simulation import SimulationConfig
+from tests.benchmarks.lane_score import DirectedGraph, score_lanes
+from tests.benchmarks.observed_tracks import observed_tracks
 from velfield.analysis.flow.conflicts import MAX_PET_S, find_conflicts
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.flow.speeds import Reduction
@@ -26,9 +28,7 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import PathSamples, Trajectories, make_trajectories, moving
 from velfield.synthetic.city.city_plan import STOP_A, STOP_B
 from velfield.synthetic.flight import Flight
-from velfield.synthetic.lane_score import DirectedGraph, score_lanes
 from velfield.synthetic.observed import NO_ERRORS, observed_detections
-from velfield.synthetic.observed_tracks import observed_tracks
 from velfield.synthetic.traffic.traffic import STEP_S
 
 GSD_M, CYCLE_S = 0.23, 60.0

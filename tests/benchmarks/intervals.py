@@ -20,6 +20,7 @@ from schemas.simulation import TrafficSimulation
 from tests.analysis.noisy_tracks import GSD_M, Noise, analyse, flight, true_tracks
 from tests.analysis.statements import Interval, Truth, queue_pairs
 from tests.benchmarks.analysis import signal_onsets_s, trajectories
+from tests.benchmarks.observed_tracks import observed_tracks
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.flow.speeds import speed_profile
 from velfield.analysis.flow.volume import lane_flow
@@ -29,7 +30,6 @@ from velfield.analysis.lanes.model import LaneGraph, LaneSamples
 from velfield.analysis.movements.movements import find_movements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import Trajectories, make_trajectories, moving, sample_paths
-from velfield.synthetic.observed_tracks import observed_tracks
 from velfield.synthetic.traffic.traffic import Traffic, simulate_traffic
 
 CLIP_S, LONG_RUN, PART_S, APART_S = 300.0, 12, 600.0, 20.0

@@ -196,22 +196,3 @@ def test_density_is_highest_for_velocities_of_the_pixel_and_never_zero() -> None
     assert here > elsewhere > nowhere > absurd
     assert np.isfinite(absurd)
     assert np.isnan(map_.log_density(xy[:1], np.array([[np.nan, 0.0]]))).all()
-
-
-def test_held_out_tracks_are_likelier_than_under_one_density_for_the_map() -> None:
-    """Two opposed lanes of 12 tracks each: at least 0.6 nats a track better."""
-    rng = np.random.default_rng(5)
-
-    def lanes(n: int) -> Segments:
-        there = drive(polar(rng.normal(13, 2, n), rng.normal(0, 2, n)), y0=40.0)
-        back = drive(polar(rng.normal(11, 2, n), rng.normal(180, 2, n)), y0=60.0)
-        back["track"] += n
-        return np.concatenate([there, back])
-
-    map_, test = field(lanes(12)), lanes(100)
-    places = np.column_stack([np.full(200, 80.0), np.repeat([40.0, 60.0], 100)])
-    v = np.column_stack([test["vx_px_per_s"], test["vy_px_per_s"]])
-    by_pixel, by_map = map_.log_density(places, v), map_.log_density(np.full((200, 2), -1000.0), v)
-    assert (
-        by_pixel - by_map
-    ).mean() > 0.6  # two lanes: the gain is at most log 2, less the estimation error of 12 tracks

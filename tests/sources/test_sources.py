@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from pydantic import ValidationError
 
 from schemas.flight import FramesConfig
 from tests.media import drifting, write_images, write_times, write_video
@@ -173,10 +172,6 @@ def test_start_and_stop_count_from_the_first_frame_and_stop_is_left_out():
     times = 100 + np.arange(10) * 0.1
     config = FramesConfig(every=2, start_s=0.3, stop_s=0.8)
     assert select_frames(times, config).tolist() == [3, 5, 7]
-    with pytest.raises(InputError, match="found no frame"):
-        select_frames(times, FramesConfig(start_s=2.0))
-    with pytest.raises(ValidationError, match="after start_s"):
-        FramesConfig(start_s=1.0, stop_s=0.5)
 
 
 @given(

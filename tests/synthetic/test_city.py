@@ -11,7 +11,7 @@ from schemas.arrays import FloatArray
 from schemas.simulation import SceneSimulation
 from tests.synthetic.test_traffic import boxes_overlap
 from velfield.synthetic.city import city_plan as p
-from velfield.synthetic.city.blocks import OccupancyGrid, box, place_buildings, place_tree, rotated_box
+from velfield.synthetic.city.blocks import OccupancyGrid, box, place_buildings, place_tree
 from velfield.synthetic.city.city_plan import make_city_plan
 from velfield.synthetic.city.ground import (
     ASPHALT,
@@ -20,7 +20,6 @@ from velfield.synthetic.city.ground import (
     NOON,
     Canvas,
     add_texture,
-    apply_light,
     light_map,
     reach_map,
 )
@@ -44,16 +43,6 @@ def test_occupied_ground_is_not_free_and_the_rest_is() -> None:
     assert grid.is_free(box(50, 25, 70, 45))
     assert grid.is_free(box(42, 20, 50, 30))
     assert not grid.is_free(box(500, 500, 510, 510))  # outside the raster
-
-
-def test_corners_of_a_rotated_box_are_at_its_length_and_width() -> None:
-    corners = rotated_box(5.0, 7.0, 10.0, 4.0, np.radians(30))
-    assert corners.mean(axis=0) == pytest.approx([5.0, 7.0])
-    sides = np.hypot(*np.diff(corners, axis=0).T)
-    assert sides == pytest.approx([10.0, 4.0, 10.0])
-    along = corners[1] - corners[0]
-    assert np.degrees(np.arctan2(along[1], along[0])) == pytest.approx(30)
-    assert rotated_box(5.0, 7.0, 10.0, 4.0, 0.0) == pytest.approx(box(0, 5, 10, 9))
 
 
 class Recorder(Canvas):
@@ -161,25 +150,6 @@ def test_shapes_are_painted_at_their_metres() -> None:
     assert (round_.paint == MARKING).all(axis=2).sum() == pytest.approx(np.pi * 100 / 0.25, rel=0.03)
 
 
-def test_dashes_have_their_period() -> None:
-    painted = canvas(pixel_m=0.1, width=1200, height=60)
-    painted.dashes(np.array([12.0, 22.0]), np.array([120.0, 22.0]), 0.6, MARKING, 3.0, 5.0)
-    row = (painted.paint[20] == MARKING).all(axis=1)
-    begins = np.flatnonzero(np.diff(row.astype(int)) == 1)
-    assert np.diff(begins) == pytest.approx(80, abs=2)  # 8 m
-    assert row.mean() == pytest.approx(3 / 8 * 108 / 120, abs=0.03)
-
-
-def test_raising_sets_polygons_and_keeps_the_higher_disc() -> None:
-    painted = canvas()
-    painted.raise_polygon(box(20, 30, 40, 60), 6.0)
-    painted.raise_disc(30.0, 45.0, 4.0, 3.0)
-    assert painted.height_m.max() == 6.0
-    painted.raise_disc(30.0, 45.0, 4.0, 9.0)
-    assert (painted.height_m == 9.0).sum() == pytest.approx(np.pi * 16, rel=0.2)
-    assert painted.height_m[0, 0] == 0.0
-
-
 def test_texture_scales_with_its_strength_and_vegetation_is_lighter_for_the_other_sensor() -> None:
     paint = np.empty((256, 256, 4), np.uint8)
     paint[:, :128], paint[:, 128:] = ASPHALT, GRASS
@@ -229,12 +199,6 @@ def test_a_shadow_is_as_long_as_height_times_the_sun_vector(direction: tuple[flo
     assert light_map(height, reach_map(height, 1.5, 0.1), step_px=0.1, direction=np.zeros(2)).min() == pytest.approx(
         NOON
     )
-
-
-def test_light_multiplies_tones_and_saturates() -> None:
-    tone = np.full((4, 4), 100, np.uint8)
-    assert (apply_light(tone, np.full((2, 2), 0.5, np.float32)) == 50).all()
-    assert (apply_light(tone, np.full((2, 2), 9.0, np.float32)) == 255).all()
 
 
 @settings(max_examples=20, deadline=None)

@@ -31,7 +31,6 @@ from velfield.synthetic.traffic.traffic import (
     road_arrays,
     simulate_traffic,
 )
-from velfield.synthetic.traffic.vehicles import LAYERS, PAINT_PROBABILITIES, PAINTS, draw_tones
 
 CONFIG = TrafficSimulation()
 CAR_M = 4.5
@@ -286,12 +285,3 @@ def test_dimensions_are_those_of_the_kinds_of_vehicle() -> None:
     assert (made.shape[large] == 3).mean() == pytest.approx(0.4, abs=0.05)
     assert (made.width_m[~large] < made.width_m[large].min()).all()
     assert made.length_m[made.shape == 0].mean() == pytest.approx(4.35, abs=0.05)
-
-
-def test_paints_have_their_probabilities_and_glass_is_dark() -> None:
-    tones = draw_tones(6000, np.random.default_rng(1))
-    for (low, high), probability in zip(PAINTS, PAINT_PROBABILITIES, strict=True):
-        assert ((tones[:, 0] >= low) & (tones[:, 0] < high)).mean() == pytest.approx(probability, abs=0.03)
-    assert tones[:, 1].max() < 60
-    assert tones[:, 2] == pytest.approx(0.62 * tones[:, 0])
-    assert (np.diff(LAYERS[:, :, 0], axis=1) < 0).all()  # highest layer first

@@ -44,17 +44,6 @@ def angle_between(a: float, b: float) -> float:
     return abs(float(np.angle(np.exp(1j * (a - b)))))
 
 
-def test_a_straight_edge_has_equidistant_points_from_node_to_node() -> None:
-    network = RoadNetwork()
-    a, b = network.node(0.0, 0.0, 0.0), network.node(30.0, 40.0, 0.0)
-    network.straight(a, b, "street", 9.0)
-    edge = network.edges[0]
-    assert edge.length_m == pytest.approx(50.0)
-    assert np.ptp(steps_m(edge.path)) < 1e-9
-    assert steps_m(edge.path)[0] == pytest.approx(STEP_M, rel=0.02)
-    assert edge.path[[0, -1]].tolist() == [[0.0, 0.0], [30.0, 40.0]]
-
-
 def test_a_turn_is_limited_by_lateral_acceleration_and_by_its_speed() -> None:
     network = RoadNetwork()
     a, b = network.node(0.0, 0.0, 0.0), network.node(10.0, 10.0, np.pi / 2)
@@ -108,14 +97,6 @@ def test_curves_are_tangent_to_both_nodes(x: float, y: float, start: float, turn
     tolerance = 0.05 + steps_m(path).max() / min_radius_m(path)
     assert angle_between(direction(step[0]), start) < tolerance
     assert angle_between(direction(step[-1]), start + turn) < tolerance
-
-
-@pytest.mark.parametrize("radius", [7.75, 30.0])
-def test_a_quarter_turn_is_nearly_an_arc(radius: float) -> None:
-    path = smooth_curve(Node(0.0, 0.0, 0.0), Node(radius, radius, np.pi / 2))
-    distance = np.hypot(path[:, 0], path[:, 1] - radius)
-    assert np.abs(distance / radius - 1).max() < 0.01
-    assert min_radius_m(path) == pytest.approx(radius, rel=0.08)
 
 
 def test_the_minimum_radius_of_a_circle_is_its_radius() -> None:

@@ -45,11 +45,6 @@ class TrackErrors:
     lateral_sd_m: float = 0.25
 
 
-NO_TRACK_ERRORS = TrackErrors(
-    cuts_per_vehicle=0.0, occluders=0, cut_by_occluder=0.0, false_per_minute=0.0, lateral_sd_m=0.0
-)
-
-
 def observed_tracks(
     traffic: Traffic,
     times_s: FloatArray,
