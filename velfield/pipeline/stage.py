@@ -246,10 +246,10 @@ STAGES: tuple[Stage, ...] = (
         label="detections",
         lines=(
             Line(
-                "{cars:.0f} cars in {frames:.0f} frames, of which {searched:.0%} was searched",
+                "{cars:.0f} marks of cars in {frames:.0f} frames; {searched:.0%} of their area was searched",
                 lambda counts: "searched" in counts,
             ),
-            Line("{cars:.0f} cars in {frames:.0f} frames"),
+            Line("{cars:.0f} marks of cars in {frames:.0f} frames"),
         ),
         block=f"{_STAGES}.detections:detect_block",
         unit=f"{_STAGES}.detections:write_detections",
