@@ -1,7 +1,5 @@
 """Stops that a tree hides, and the onset of red by crossings that thin out."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -65,7 +63,7 @@ def test_who_is_hidden_while_it_stands_crosses_the_line_after_it(whole: TrafficA
     assert (np.diff(found.cross_time_s) >= 0).all()
 
 
-def test_the_onset_of_red_is_where_crossings_end(whole: TrafficAnalysis) -> None:
+def test_the_onset_of_red_is_where_crossings_end() -> None:
     """Crossings thin out linearly over the last 1.2 s before 18 s of a cycle; 90 % intervals hold that."""
     rng, red_s, thinning_s, cycles = np.random.default_rng(3), 18.0, 1.2, 12
     errors, held = [], []
@@ -76,8 +74,7 @@ def test_the_onset_of_red_is_where_crossings_end(whole: TrafficAnalysis) -> None
             kept = rng.uniform(size=len(t)) < (red_s - t) / thinning_s
             times.append(t[kept] + cycle * CYCLE_S)
         crossings = np.sort(np.concatenate(times))
-        stream = replace(first_stream(whole), cross_time_s=crossings)
-        found = _red_onset(stream, 0.0, Estimate(CYCLE_S, CYCLE_S, CYCLE_S, cycles))
+        found = _red_onset(crossings, 0.0, Estimate(CYCLE_S, CYCLE_S, CYCLE_S, cycles))
         assert found is not None
         errors.append(found.value - red_s)
         held.append(found.low <= red_s <= found.high)

@@ -14,6 +14,7 @@ from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.intervals import estimate_censored_quantile, estimate_quantile, estimate_rate, estimate_share
 from velfield.analysis.movements.gates import Arm, Gate, Gates
 from velfield.analysis.movements.movements import furness
+from velfield.analysis.signals.coordination import queue_growth
 from velfield.analysis.signals.cycles import find_signal, queues
 from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -141,9 +142,9 @@ def test_without_a_cycle_there_is_no_signal(analysis: TrafficAnalysis) -> None:
     streams = next(s for s in analysis.streams.values() if any(len(x.head_time_s) for x in s))
     rng = np.random.default_rng(0)
     scattered = [replace(s, head_time_s=np.sort(rng.uniform(0, 480, len(s.head_time_s)))) for s in streams]
-    assert find_signal(0, scattered, 0.0, 480.0).signalised is False
+    assert find_signal(0, scattered, np.array([[0.0, 480.0]])).signalised is False
     few = [replace(s, head_time_s=s.head_time_s[:1]) for s in streams]
-    assert find_signal(0, few, 0.0, 480.0).signalised is None
+    assert find_signal(0, few, np.array([[0.0, 480.0]])).signalised is None
 
 
 def test_free_flow_and_edie(analysis: TrafficAnalysis) -> None:
@@ -421,6 +422,38 @@ def test_few_pairs_that_cross_where_levels_are_not_clear_are_neither_conflicts_n
     junction = analysis.lanes.junctions[0].hull_m
     signalised = find_conflicts(analysis.trajectories, analysis.lane_traffic, signalised_m=[junction])
     assert sum(c.kind == "crossing" and c.probability > 0.5 for c in signalised) == 4
+
+
+def in_two_clips(second_s: float, begin_s: float, cut_s: float, end_s: float) -> TrafficAnalysis:
+    """The crossroads as two clips, cut at ``cut_s``, of which the second is later by ``second_s``."""
+    tracks = []
+    for times, xy in crossroads():
+        for rows, later in ((times >= begin_s) & (times < cut_s), 0.0), ((times >= cut_s) & (times < end_s), second_s):
+            if rows.sum() > 2:
+                tracks.append((times[rows] + later, xy[rows]))
+    return TrafficAnalysis(replace(gather(tracks), gaps_s=np.array([[cut_s, cut_s + second_s]])))
+
+
+def test_a_signal_is_found_in_both_clips_though_the_gap_is_no_whole_number_of_cycles() -> None:
+    analysis = in_two_clips(1013.0, 0.0, 250.0, 500.0)
+    (signal,) = (s for s in analysis.signals.values() if s.signalised)
+    assert signal.cycle_s is not None
+    assert signal.cycle_s.value == pytest.approx(CYCLE_S, abs=0.15)
+    for stream in signal.streams:
+        green = stream.green_s
+        assert not ((green > 250.0) & (green < 1263.0)).any()
+        first, second = (np.exp(2j * np.pi * (g - shift) / CYCLE_S).mean() for g, shift in
+                         ((green[green < 250.0], 0.0), (green[green > 1263.0], 1013.0)))  # fmt: skip
+        assert abs(np.angle(second / first)) / (2 * np.pi) * CYCLE_S < 0.8
+        assert stream.red_phase_s is not None
+    growth = [g for g in queue_growth(signal) if g.vehicles]
+    assert max(g.vehicles.value for g in growth if g.vehicles) == pytest.approx(4, abs=0.3)
+
+
+def test_clips_that_hold_no_two_cycles_give_none_together() -> None:
+    signals = in_two_clips(1013.0, 200.0, 245.0, 290.0).signals.values()
+    assert len(signals) == 1
+    assert all(s.signalised is None and s.reason.startswith("too little data") for s in signals)
 
 
 def test_two_starts_do_not_make_a_certain_cycle() -> None:

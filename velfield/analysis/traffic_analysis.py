@@ -174,7 +174,7 @@ class TrafficAnalysis:
         Where lanes only merge, vehicles stop in the rhythm of the signals around.
         """
         return {
-            number: find_signal(number, streams, *self.window_s)
+            number: find_signal(number, streams, self.trajectories.observed_s)
             for number, streams in self.streams.items()
             if self.lanes.junctions[number].kind in ("intersection", "roundabout", "crossing")
         }

@@ -49,8 +49,8 @@ def queue_growth(signal: JunctionSignal) -> list[QueueGrowth]:
             continue
         cycle = signal.cycle_s.value
         red_s = (stream.green_phase_s.value - stream.red_phase_s.value) % cycle
-        # whole reds alone: a flight may begin within one
-        greens = stream.green_s[1:]
+        # whole reds alone: what is seen may begin within one
+        greens = stream.green_s[1:][np.diff(stream.green_s) < 1.5 * cycle]
         for after in [*np.arange(0.0, red_s - _STEP_S / 2, _STEP_S).tolist(), red_s]:
             found = queues(stream.stream, greens - red_s + after)
             counts, lengths = np.array([(q.vehicles.value, q.length_m) for q in found]).reshape(-1, 2).T

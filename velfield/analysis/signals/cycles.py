@@ -1,6 +1,6 @@
 """Cycles: whether the starts of queues recur, and when each stream has green."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +8,7 @@ from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
-from velfield.analysis.signals.phases import fit_phases
+from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
 from velfield.analysis.signals.queues import Stream
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
@@ -92,14 +92,25 @@ class JunctionSignal:
     phases: tuple[tuple[int, ...], ...]
 
 
-def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s: float) -> JunctionSignal:
-    """The signal of a junction from its streams, seen from ``begin_s`` to ``end_s``."""
-    used = [stream for stream in streams if len(_queue_heads(stream)) >= MIN_STARTS]
-    events = [_queue_heads(stream) for stream in used]
-    n, duration = sum(len(times) for times in events), end_s - begin_s
+def find_signal(junction: int, streams: Sequence[Stream], observed_s: FloatArray) -> JunctionSignal:
+    """The signal of a junction from its streams, seen in times (k, 2) from begins to ends.
+
+    The cycle is that of the time with most starts of queues: over a gap, as between clips, its error would grow to a
+    cycle. In the other times the signal is late by what their own starts show.
+    """
+    by_time = [
+        [(stream, times) for stream in streams if len(times := _within(_queue_heads(stream), *seen)) >= MIN_STARTS]
+        for seen in observed_s
+    ]
+    counts = [sum(len(times) for _, times in found) for found in by_time]
+    main = int(np.argmax(counts)) if counts else 0
+    used = [stream for stream, _ in by_time[main]] if counts else []
+    events = [times for _, times in by_time[main]] if counts else []
+    n, duration = max(counts, default=0), float(np.diff(observed_s[main])[0]) if counts else 0.0
     stopped, share = _stopping(streams)
     if n < _JUNCTION_STARTS:
-        if share is not None and share.n >= _FEW_STOP_N and share.high < _FEW_STOP and duration >= _FEW_STOP_S:
+        few = share is not None and share.n >= _FEW_STOP_N and share.high < _FEW_STOP
+        if share is not None and few and sum(counts) < _JUNCTION_STARTS and np.diff(observed_s).sum() >= _FEW_STOP_S:
             most = f"at most {100 * share.high:.1f} % stop"
             reason = f"no signal: {stopped} of {share.n} vehicles stopped, {most} with 95 % probability"
             return JunctionSignal(junction, False, reason, None, (), ())
@@ -129,9 +140,10 @@ def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s:
         )
         return JunctionSignal(junction, None, reason, None, (), ())
     estimate, phases = fit_phases(events, cycle, time_sd_s=max(stream.stop_time_sd_s for stream in used))
-    signals = [
-        _stream_signal(used[k], phase.green_s, estimate, begin_s, end_s) for phase in phases for k in phase.streams
-    ]
+    greens = {used[k].approach.lane: phase.green_s for phase in phases for k in phase.streams}
+    late = [0.0 if k == main else _late_s(found, greens, estimate.value) for k, found in enumerate(by_time)]
+    seen_late = [(seen, by) for seen, by in zip(observed_s, late, strict=True) if by is not None]
+    signals = [_stream_signal(used[k], phase.green_s, estimate, seen_late) for phase in phases for k in phase.streams]
     lanes = tuple(tuple(sorted(used[k].approach.lane for k in phase.streams)) for phase in phases)
     return JunctionSignal(junction, True, "", estimate, _with_hidden_share(signals), lanes)
 
@@ -144,6 +156,20 @@ def _with_hidden_share(signals: Sequence[StreamSignal]) -> tuple[StreamSignal, .
     share = estimate_share(hidden, hidden + sum(f.seen for f in found))
     sure = share.low if share else 0.0
     return tuple(replace(s, stream=replace(s.stream, hidden_share=sure)) for s in signals)
+
+
+def _within(times_s: FloatArray, begin_s: float, end_s: float) -> FloatArray:
+    return times_s[(times_s >= begin_s) & (times_s <= end_s)]
+
+
+def _late_s(found: Sequence[tuple[Stream, FloatArray]], greens: Mapping[int, Estimate], cycle_s: float) -> float | None:
+    """By how much the signal is later in another time than by its cycle, by starts of queues in it; None: these do not
+    show it."""
+    after = [times - greens[s.approach.lane].value - START_DELAY_S for s, times in found if s.approach.lane in greens]
+    if sum(map(len, after)) < _JUNCTION_STARTS:
+        return None
+    mean = complex(np.exp(2j * np.pi * np.concatenate(after) / cycle_s).mean())
+    return float(np.angle(mean) / (2 * np.pi) * cycle_s) if abs(mean) >= _MIN_CONCENTRATION else None
 
 
 def _queue_heads(stream: Stream) -> FloatArray:
@@ -202,17 +228,26 @@ def _chance(events: Sequence[FloatArray], frequency: FloatArray, concentration: 
     return float((1 + np.sum(best >= concentration - 1e-9)) / (1 + _DRAWS))
 
 
-def _stream_signal(stream: Stream, green: Estimate, cycle: Estimate, begin_s: float, end_s: float) -> StreamSignal:
-    value, cycle_s = green.value, cycle.value
-    k = np.arange(np.ceil((begin_s - value) / cycle_s), np.floor((end_s - value) / cycle_s) + 1)
-    lost, saturation = _discharge(stream, value + k * cycle_s)
-    return StreamSignal(stream, green, _red_onset(stream, value, cycle), value + k * cycle_s, lost, saturation)
+def _stream_signal(
+    stream: Stream, green: Estimate, cycle: Estimate, seen_late: Sequence[tuple[FloatArray, float]]
+) -> StreamSignal:
+    """The signal of a stream in times that are seen, in each of which it is later than by its cycle."""
+    onsets, crossed = [], []
+    for (begin, end), late in seen_late:
+        value = green.value + late
+        k = np.arange(np.ceil((begin - value) / cycle.value), np.floor((end - value) / cycle.value) + 1)
+        onsets.append(value + k * cycle.value)
+        crossed.append(_within(stream.cross_time_s, begin, end) - late)
+    green_s = np.concatenate(onsets)
+    lost, saturation = _discharge(stream, green_s)
+    red = _red_onset(np.concatenate(crossed), green.value, cycle)
+    return StreamSignal(stream, green, red, green_s, lost, saturation)
 
 
-def _red_onset(stream: Stream, green_s: float, cycle: Estimate) -> Estimate | None:
+def _red_onset(cross_time_s: FloatArray, green_s: float, cycle: Estimate) -> Estimate | None:
     """Onset of red: when the crossings of the stop line end, those of vehicles too near to stop at yellow included."""
     cycle_s = cycle.value
-    crossed = np.sort((stream.cross_time_s - green_s) % cycle_s)
+    crossed = np.sort((cross_time_s - green_s) % cycle_s)
     n = len(crossed)
     if n < _MIN_CROSSINGS:
         return None
@@ -233,7 +268,7 @@ def _red_onset(stream: Stream, green_s: float, cycle: Estimate) -> Estimate | No
     early, middle, late = (_last_crossing_gap(p, rate) for p in ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
     value = quiet_s + last + middle
     # the onset is that of second 0, the crossings are of some cycles later
-    drift = float(np.abs(stream.cross_time_s).mean()) / cycle_s * (cycle.high - cycle.low) / 2
+    drift = float(np.abs(cross_time_s).mean()) / cycle_s * (cycle.high - cycle.low) / 2
     systematic = float(np.hypot(special.ndtri((1 + LEVEL) / 2) * _RED_SD_S, drift))
     low = value - float(np.hypot(middle - early, systematic))
     high = value + float(np.hypot(late - middle, systematic))

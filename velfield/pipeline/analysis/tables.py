@@ -121,9 +121,9 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     rows = ((found, m) for found in analysis.movements for m in found.movements)
     note = (
         "Arms are named by the side of the image. Inferred: a track is cut, and its other end follows from what enters "
-        "and leaves (Furness). Delay is against the fastest tenth of those that do not stop. Levels of service: Highway "
-        "Capacity Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere; none where it is not known "
-        "which."
+        "and leaves (Furness). Delay is against the fastest tenth of those that do not stop. Levels of service: "
+        "Highway Capacity Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere; none where it is not "
+        "known which."
     )
 
     def place(row: tuple[JunctionMovements, Movement]) -> GeometryRecord:
