@@ -25,7 +25,7 @@ def low_coverage_note(pixels: int, pixels_5: int) -> str:
         return ""
     fraction = f"{percent(pixels_5, pixels)} of the known pixels were" if pixels_5 else "No pixel was"
     if 0 < pixels_5 < 0.01 * pixels:
-        fraction = f"{pixels_5} of {pixels} known pixels were"
+        fraction = f"{pixels_5} of {pixels} known pixels {'was' if pixels_5 == 1 else 'were'}"
     return (
         f"{fraction} passed by 5 or more vehicles. Directions are reliable; speeds and percentiles are those of "
         "single vehicles. Record for longer, or merge several flights."

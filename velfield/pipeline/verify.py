@@ -131,7 +131,7 @@ def describe_damage(root: Path, damages: Sequence[Damage]) -> str:
     lines = [damage.text() for damage in damages]
     if not has_damage(damages):
         return "\n".join([*lines, f"{root}: what is there is whole; {units} units were never finished"])
-    return "\n".join([*lines, f"{root}: {len(damages)} faults in {units} units"])
+    return "\n".join([*lines, f"{root}: faults: {len(damages)}, units that they lie in: {units}"])
 
 
 def has_damage(damages: Sequence[Damage]) -> bool:
