@@ -11,12 +11,13 @@ from velfield.registration.coarse import (
     MIN_INLIERS,
     downscale,
     estimate_sift_homography,
-    is_plausible,
     scaling_matrix,
     search_similarity,
     sift_scale,
     similarity_matrix,
 )
+from velfield.registration.keypoints import is_plausible
+from velfield.registration.transforms import HomographyTransform, frame_corners
 
 SHAPE = (240, 320)
 CENTRE = np.array([159.5, 119.5])
@@ -111,7 +112,7 @@ def test_too_few_features_or_matches_give_no_matrix_but_their_numbers(ground: np
     ],
 )
 def test_plausible_maps_keep_handedness_and_shape(matrix: np.ndarray, plausible: bool) -> None:
-    assert is_plausible(matrix, SHAPE) is plausible
+    assert is_plausible(HomographyTransform(matrix), frame_corners(*SHAPE[::-1])) is plausible
 
 
 def centre_error_px(matrix: np.ndarray, to_base: np.ndarray) -> float:

@@ -167,7 +167,7 @@ STAGES: tuple[Stage, ...] = (
     # Spread frames registered to the sharpest, and their median; or the registration of a given image.
     Stage(
         name="base",
-        version=17,
+        version=18,
         label="base image",
         lines=(
             Line(

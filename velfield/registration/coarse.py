@@ -11,16 +11,18 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage
+from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
+from velfield.registration.keypoints import detect_keypoints, is_plausible, match_descriptors
 from velfield.registration.modality import MODALITIES, Modality, Transform
+from velfield.registration.transforms import HomographyTransform, frame_corners
 
 MIN_INLIERS = 10
 """Fewer SIFT inliers may be due to chance."""
 
 _MIN_SIFT_SIDE_PX = 700.0
 _SIFT_FEATURES = 4000
-_RATIO = 0.85
 _INLIER_PX = 4.0
 _SEARCH_SIDE_PX = 640.0
 _MIN_TEMPLATE_HALF_PX = 12
@@ -73,17 +75,6 @@ def sift_scale(shape: tuple[int, ...], scale: float) -> float:
     return float(min(1.0, max(scale, _MIN_SIFT_SIDE_PX / max(shape))))
 
 
-def _detect_root_sift(grey: GreyImage, scale: float) -> tuple[FloatArray, Float32Array]:
-    """Positions (n, 2), px of the full image, and RootSIFT descriptors (n, 128)."""
-    sift = cv2.SIFT.create(nfeatures=_SIFT_FEATURES, contrastThreshold=0.02)
-    keypoints, descriptors = sift.detectAndCompute(downscale(grey, scale), None)
-    if descriptors is None or len(keypoints) < 2:
-        return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
-    small = np.array([point.pt for point in keypoints], dtype=np.float64)
-    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
-    return (small + 0.5) / scale - 0.5, np.sqrt(descriptors / total).astype(np.float32)
-
-
 def estimate_sift_homography(
     image: GreyImage, base: GreyImage, lens: Lens, *, scale: float, mirrored: bool = False
 ) -> SiftHomography:
@@ -102,45 +93,27 @@ def estimate_sift_homography(
     """
     if mirrored:
         image = np.ascontiguousarray(image[:, ::-1])
-    xy, descriptors = _detect_root_sift(image, sift_scale(image.shape, scale))
-    base_xy, base_descriptors = _detect_root_sift(base, sift_scale(base.shape, scale))
-    if min(len(xy), len(base_xy)) < MIN_INLIERS:
-        return SiftHomography(None, min(len(xy), len(base_xy)), 0)
-    source, target = _match_mutual(lens.undistort_points(xy), descriptors, base_xy, base_descriptors)
+    of_image, of_base = (
+        detect_keypoints(grey, RegistrationConfig(keypoint_scale=sift_scale(grey.shape, scale)), count=_SIFT_FEATURES)
+        for grey in (image, base)
+    )
+    pairs = match_descriptors(_root(of_image.descriptors), _root(of_base.descriptors))
+    source, target = lens.undistort_points(of_image.xy[pairs[:, 0]]), of_base.xy[pairs[:, 1]]
+    finite = np.isfinite(source).all(axis=1)
+    source, target = source[finite], target[finite]
     if len(source) < MIN_INLIERS:
         return SiftHomography(None, len(source), 0)
     matrix, mask = cv2.findHomography(source, target, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=20_000, confidence=0.9999)
     inliers = 0 if mask is None else int(mask.sum())
-    plausible = matrix is not None and inliers >= MIN_INLIERS and is_plausible(matrix, image.shape)
-    return SiftHomography(np.asarray(matrix) if plausible else None, len(source), inliers)
+    corners = frame_corners(image.shape[1], image.shape[0])
+    found = matrix is not None and inliers >= MIN_INLIERS and is_plausible(HomographyTransform(matrix), corners)
+    return SiftHomography(np.asarray(matrix) if found else None, len(source), inliers)
 
 
-def _match_mutual(
-    xy: FloatArray, descriptors: Float32Array, base_xy: FloatArray, base_descriptors: Float32Array
-) -> tuple[FloatArray, FloatArray]:
-    """Cross-checked matches that pass the ratio test."""
-    similarities = descriptors @ base_descriptors.T
-    best = similarities.argmax(axis=1)
-    mutual = similarities.argmax(axis=0)[best] == np.arange(len(xy))
-    top = np.partition(similarities, -2, axis=1)[:, -2:]
-    distance = np.sqrt(np.maximum(2.0 - 2.0 * np.sort(top, axis=1), 0.0))
-    unambiguous = distance[:, 1] < _RATIO * distance[:, 0]
-    matched = mutual & unambiguous & np.isfinite(xy).all(axis=1)
-    return xy[matched], base_xy[best[matched]]
-
-
-def is_plausible(matrix: FloatArray, shape: tuple[int, ...]) -> bool:
-    """Whether a homography (3, 3) preserves the frame's handedness and roughly its shape, as a nadir camera does."""
-    height, width = shape[:2]
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)
-    mapped = np.column_stack([corners, np.ones(4)]) @ matrix.T
-    if np.any(mapped[:, 2] * mapped[0, 2] <= 0):
-        return False
-    xy = mapped[:, :2] / mapped[:, 2:]
-    sides = np.roll(xy, -1, axis=0) - xy
-    cross = sides[:, 0] * np.roll(sides, -1, axis=0)[:, 1] - sides[:, 1] * np.roll(sides, -1, axis=0)[:, 0]
-    scale = np.linalg.norm(sides, axis=1) / np.array([width, height, width, height])
-    return bool(np.all(cross > 0) and scale.max() < 5.0 * scale.min() and 0.1 < scale.mean() < 10.0)
+def _root(descriptors: ByteArray) -> Float32Array:
+    """RootSIFT: more matches hold between two sensors."""
+    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1.0)
+    return np.asarray(np.sqrt(descriptors / sums), np.float32)
 
 
 def similarity_matrix(scale: float, rotation_rad: float, source: FloatArray, target: FloatArray) -> FloatArray:
@@ -227,8 +200,7 @@ def _reduce_base(
 
 
 def _map_point(matrix: FloatArray, point: FloatArray) -> FloatArray:
-    mapped = matrix @ np.array([point[0], point[1], 1.0])
-    return np.asarray(mapped[:2] / mapped[2])
+    return np.asarray(HomographyTransform(matrix)(point[None])[0])
 
 
 def _cut_template(image: GreyImage, lens: Lens, to_small: FloatArray, centre: FloatArray, half: int) -> GreyImage:
@@ -236,8 +208,7 @@ def _cut_template(image: GreyImage, lens: Lens, to_small: FloatArray, centre: Fl
     mapped_centre = _map_point(to_small, centre)
     stretch = float(np.linalg.norm(_map_point(to_small, centre + np.array([1.0, 0.0])) - mapped_centre))
     grid = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), axis=-1).reshape(-1, 2)
-    undistorted = np.column_stack([grid + mapped_centre, np.ones(len(grid))]) @ np.linalg.inv(to_small).T
-    raw = lens.distort_points(undistorted[:, :2] / undistorted[:, 2:])
+    raw = lens.distort_points(HomographyTransform(to_small).inverse(grid + mapped_centre))
     scale = min(1.0, stretch)
     raw_small = ((raw + 0.5) * scale - 0.5).reshape(2 * half + 1, 2 * half + 1, 2).astype(np.float32)
     return np.asarray(cv2.remap(downscale(image, scale), raw_small, None, cv2.INTER_LINEAR), dtype=np.uint8)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from schemas.arrays import ByteArray, FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.errors import Failure
 from velfield.registration.transforms import HomographyTransform
@@ -119,7 +119,7 @@ _MIN_PRIOR_MATCHES = 16
 _MAX_STRETCH = 6.0
 
 
-def match_descriptors(moving: ByteArray, reference: ByteArray) -> Pairs:
+def match_descriptors(moving: ByteArray | Float32Array, reference: ByteArray | Float32Array) -> Pairs:
     """Cross-checked matches of descriptors (n, 128) and (m, 128) that pass the ratio test."""
     if len(moving) < 2 or len(reference) < 2:
         return np.zeros((0, 2), np.int64)
@@ -157,13 +157,13 @@ def fit_homography(source: FloatArray, target: FloatArray) -> HomographyTransfor
     if matrix is None or n_inliers < _MIN_PRIOR_MATCHES:
         return Failure(f"{n_inliers} inliers of {len(source)} matches, {_MIN_PRIOR_MATCHES} needed")
     prior = HomographyTransform(np.asarray(matrix / matrix[2, 2], dtype=np.float64))
-    if not _is_plausible(prior, source[inliers.ravel() > 0]):
+    if not is_plausible(prior, source[inliers.ravel() > 0]):
         return Failure(f"the homography of {n_inliers} inliers mirrors, folds or stretches the frame")
     return prior
 
 
-def _is_plausible(prior: HomographyTransform, xy: FloatArray) -> bool:
-    """Whether the map preserves handedness, with a scale within 6-fold, at its inliers (n, 2)."""
+def is_plausible(prior: HomographyTransform, xy: FloatArray) -> bool:
+    """Whether the map preserves handedness, with a scale within 6-fold, at points (n, 2)."""
     step = 1.0
     here = prior(xy)
     along_x, along_y = prior(xy + np.array([step, 0.0])) - here, prior(xy + np.array([0.0, step])) - here
