@@ -276,7 +276,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=14,
+        version=15,
         label="tracks",
         lines=(
             Line(

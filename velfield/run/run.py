@@ -190,15 +190,21 @@ class Run:
         transformed: Points = getattr(transform, direction)(points)
         return transformed
 
-    def detections(self) -> pd.DataFrame:
+    def detections(self, *, doubtful: bool = False) -> pd.DataFrame:
         """Detections, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``.
 
-        Candidates below the score threshold are among them where a track confirms them. Those of doubtful tracks
-        (`vehicles`) are not.
+        Candidates below the score threshold are among them where a track confirms them.
+
+        Parameters
+        ----------
+        doubtful
+            With those of doubtful tracks (`vehicles`).
         """
         found = self._all_detections(list(DETECTION_COLUMNS))
-        doubtful = self._tracklets_of(self.layout.doubtful, [f"detection_id_{k}" for k in range(3)])
-        return found[~found["detection_id"].isin(np.unique(doubtful.to_numpy()))].reset_index(drop=True)
+        if doubtful:
+            return found
+        apart = self._tracklets_of(self.layout.doubtful, [f"detection_id_{k}" for k in range(3)])
+        return found[~found["detection_id"].isin(np.unique(apart.to_numpy()))].reset_index(drop=True)
 
     def _all_detections(self, names: list[str]) -> pd.DataFrame:
         self.require_frames()

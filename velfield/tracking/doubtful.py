@@ -15,17 +15,19 @@ MOVED_M = 2.0
 """A displacement of half a car's length is no error of its position."""
 _ENDS = 3
 """Positions averaged at each end of a track that has twice as many; of a shorter one fewer."""
+_STANDS_M = 1.0
+"""A thing that may have moved farther is not doubted."""
 _MIN_TRAFFIC = 10
 """Fewer moving vehicles do not tell the usual score."""
-_DRIVEN_M = 2.0
-"""A thing nearer than this to a path of the traffic stands in a lane."""
+_DRIVEN_M = 6.0
+"""A thing nearer than this to a path of the traffic stands in a lane or at the kerb."""
 _LEAST, _SLOPE, _SCALE_M, _ENOUGH = -0.51, 0.64, 5.0, 0.7
 """Least score, over the median score of the traffic, at a distance d from the nearest sure vehicle:
 _LEAST + _SLOPE ln(1 + d / _SCALE_M), which is 0 at 6 m and 0.5 at 19 m; at most _ENOUGH, reached at 28 m.
 
 By logistic regression on what stands in five simulated cities (736 vehicles, 157 other things) and a clip of 1080p (43,
-100), each flight and each kind weighing alike. Of the cities it keeps 0.995 of the vehicles and 36 other things, of the
-clip 0.907 and 50.
+100), each flight and each kind weighing alike. Of the cities it keeps 0.997 of the vehicles and 43 other things, of the
+clip 0.930 and 50.
 """
 
 
@@ -46,17 +48,19 @@ def find_doubtful(positions: pd.DataFrame, score: pd.Series, metres: float) -> I
     places = groups[["x_px", "y_px"]].median()
     xy_m, scores = places.to_numpy(np.float64) * metres, score.reindex(places.index).to_numpy(np.float64)
     between = end_means(table, last=True) - end_means(table, last=False)
-    moved = np.hypot(*between[["x_px", "y_px"]].to_numpy(np.float64).T) * metres > MOVED_M
+    displacement_m = np.hypot(*between[["x_px", "y_px"]].to_numpy(np.float64).T) * metres
+    moved = displacement_m > MOVED_M
     usual = float(np.median(scores[moved])) if moved.sum() >= _MIN_TRAFFIC else 0.0
     if usual <= 0:
         return np.empty(0, np.int64)
     moving = np.repeat(moved, groups.size().to_numpy())
     driven_m = table.loc[moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres
     cells = np.unique(np.rint(driven_m), axis=0)  # of 1 m: a long flight has many positions
-    in_lane = cKDTree(cells).query(xy_m)[0] < _DRIVEN_M
+    stands = displacement_m < _STANDS_M
+    at_road = cKDTree(cells).query(xy_m)[0] < _DRIVEN_M
     distance_m = _distances_to_others(xy_m, scores >= usual)
     least = np.minimum(_LEAST + _SLOPE * np.log1p(distance_m / _SCALE_M), _ENOUGH)
-    return np.asarray(places.index.to_numpy(np.int64)[~moved & ~in_lane & (scores < usual * least)])
+    return np.asarray(places.index.to_numpy(np.int64)[stands & ~at_road & (scores < usual * least)])
 
 
 def end_means(positions: pd.DataFrame, *, last: bool) -> pd.DataFrame:
