@@ -164,7 +164,7 @@ def _scene(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> N
     results.values["scene: of these found"].append(sum(near))
     results.values["scene: arms, false"].append(len(near) - sum(near))
     gates, arms = found.scene.gates, found.scene.arms
-    truth = trace_trips(true.cut_tracks, true.lanes, gates, arms, true.window_s)
+    truth = trace_trips(true.cut_tracks, true.lanes, gates, arms)
     entered = len(found.scene.trips.track), len(truth.trips.track)
     results.values["scene: vehicles entered, error in %"].append(100 * abs(entered[0] / entered[1] - 1))
     counts, known = ({(r.origin.number, r.destination.number): r for r in s.relations} for s in (found.scene, truth))
