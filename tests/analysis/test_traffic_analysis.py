@@ -240,11 +240,20 @@ def test_a_fast_approach_is_a_conflict_and_a_queue_and_a_double_are_none() -> No
     assert conflict.probability > 0.9
 
 
+def test_who_closes_up_beside_another_vehicle_is_no_conflict() -> None:
+    free = [drive(EAST, 8.0 * k) for k in range(12)]
+    leader, follower = approach(120.0, 30.0, 12.0, 6.0, 1.0)
+    behind = TrafficAnalysis(gather([*free, leader, follower])).conflicts
+    beside = TrafficAnalysis(gather([*free, leader, (follower[0], follower[1] + [0.0, 2.8])])).conflicts
+    assert [c.probability > 0.9 for c in behind if c.kind == "following"] == [True]
+    assert max((c.probability for c in beside if c.kind == "following"), default=0.0) < 0.1
+
+
 def test_a_vehicle_that_leaves_its_lane_and_comes_back_is_not_on_it_between() -> None:
     detour = np.array([[0.0, 100.0], [100.0, 100.0], [100.0, 130.0], [130.0, 130.0], [130.0, 100.0], [260.0, 100.0]])
     analysis = TrafficAnalysis(gather([*(drive(EAST, 8.0 * k) for k in range(12)), drive(detour, 100.0)]))
     paths = analysis.trajectories
-    lane, _ = positions_on_lanes(paths, analysis.lanes)
+    lane, _, _ = positions_on_lanes(paths, analysis.lanes)
     away = np.abs(paths.xy_m[:, 1] - 100.0) > 4.0
     assert away.sum() > 20
     assert (lane[away] < 0).all()

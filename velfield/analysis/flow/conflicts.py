@@ -59,7 +59,7 @@ class Conflict:
         Post-encroachment time (crossing, merging), or least time to collision (following), and its standard deviation.
     probability
         That it is below ``threshold_s``, and of crossing that the roads are on one level; of following, and that the
-        follower must brake harder than `HARD_BRAKING_M_PER_S2` not to collide.
+        follower must brake harder than `HARD_BRAKING_M_PER_S2` not to collide, and is behind, not beside.
     one_level
         Probability that the roads are on one level.
     """
@@ -259,7 +259,7 @@ def time_to_collision(
     time: two tracks of one vehicle, or vehicles side by side on a wide lane. A pair's value is the least that holds
     for `_PERSISTENCE_S`, not that of one noisy frame. ``sds``: standard deviations of a position, m, and a speed, m/s.
     """
-    lane, along = positions_on_lanes(trajectories, graph)
+    lane, along, offset = positions_on_lanes(trajectories, graph)
     rows = np.flatnonzero(lane >= 0)
     frame = trajectories.frame[rows] - trajectories.frame.min(initial=0)
     rows = rows[group_rows(frame, int(frame.max(initial=0)) + 1)[0]]
@@ -282,6 +282,8 @@ def time_to_collision(
     needed = np.minimum(threshold_s * closing, closing**2 / (2 * HARD_BRAKING_M_PER_S2))
     slope = np.minimum(threshold_s, closing / HARD_BRAKING_M_PER_S2)
     probability = special.ndtr((needed - gap) / np.hypot(gap_sd, slope * closing_sd))
+    # and that they are not beside each other: errors may put a vehicle on the next lane
+    probability *= special.ndtr((VEHICLE_WIDTH_M - np.abs(offset[a] - offset[b])) / gap_sd)
     best = np.lexsort((value, pair))
     _, first = np.unique(pair[best], return_index=True)
     return [
@@ -371,20 +373,24 @@ def persistent(pair: IntArray, time_s: FloatArray, value_s: FloatArray) -> Float
     return out
 
 
-def positions_on_lanes(trajectories: Trajectories, graph: LaneGraph) -> tuple[IntArray, FloatArray]:
-    """Lane of each position (m,), -1: none, and distance along it, m."""
+def positions_on_lanes(trajectories: Trajectories, graph: LaneGraph) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Lane of each position (m,), -1: none, distance along it, and to the right of its centre line, m."""
     samples = graph.samples
     if not len(samples) or not len(trajectories):
-        return np.full(len(trajectories.time_s), -1), np.zeros(len(trajectories.time_s))
+        none = np.zeros(len(trajectories.time_s))
+        return np.full(len(none), -1), none, none
     lane, along = _between(
         trajectories.first, trajectories.time_s, samples.track, samples.lane, samples.along_m, samples.time_s
     )
-    for one in graph:  # who left the lane, and came back, was elsewhere between two samples on it
+    offset = np.zeros(len(along))
+    for one in graph:
         rows = np.flatnonzero(lane == one.number)
-        at = np.column_stack([np.interp(along[rows], one.along_m, one.xy_m[:, k]) for k in (0, 1)])
-        away = np.hypot(*(trajectories.xy_m[rows] - at).T) > _ON_LANE_M
-        lane[rows[away]] = -1
-    return lane, along
+        x, y = (trajectories.xy_m[rows, k] - np.interp(along[rows], one.along_m, one.xy_m[:, k]) for k in (0, 1))
+        way = np.interp(along[rows], one.along_m, np.unwrap(one.direction_rad))
+        offset[rows] = y * np.cos(way) - x * np.sin(way)
+        # who left the lane, and came back, was elsewhere between two samples on it
+        lane[rows[np.hypot(x, y) > _ON_LANE_M]] = -1
+    return lane, along, offset
 
 
 @kernel
