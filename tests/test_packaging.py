@@ -68,6 +68,9 @@ def test_the_licences_of_what_ships_are_listed() -> None:
     record = json.loads((ROOT / "velfield/detection/shipped_detector.json").read_bytes())
     data = [re.split(r" \(|,| simulated", text)[0] for text in record["attribution"]]
     assert [name for name in data if name.lower() not in listed.lower()] == []
+    weights = [str(path.relative_to(ROOT)) for path in (ROOT / "velfield").rglob("*.json")]
+    assert weights
+    assert [path for path in weights if f"`{path}`" not in listed] == []
 
 
 def test_the_citation_and_the_changelog_are_of_this_version() -> None:
