@@ -22,8 +22,7 @@ _NEWTON_TOLERANCE = 1e-13
 
 
 class RadialModel(NamedTuple):
-    """An undistortion as compiled code takes it, see `undistort`: offsets from the centre are multiplied by a power of
-    a polynomial in the squared radius."""
+    """An undistortion: offsets from the centre are multiplied by a power of a polynomial in the squared radius."""
 
     centre_x_px: float
     centre_y_px: float
@@ -42,11 +41,6 @@ class Lens(Protocol):
     @property
     def is_identity(self) -> bool:
         """Whether raw and undistorted pixels are the same."""
-        ...
-
-    @property
-    def radial(self) -> RadialModel:
-        """The undistortion, for compiled code."""
         ...
 
     def undistort_points(self, xy_raw: Points) -> Points:
@@ -101,18 +95,16 @@ def _scale_by_polynomial(points: FloatArray, lens: RadialModel) -> FloatArray:
     return out
 
 
-@kernel
-def undistort(points: FloatArray, lens: RadialModel) -> FloatArray:
-    """Raw pixels (n, 2) to undistorted pixels (n, 2) by a `RadialModel`; NaN rows outside its domain."""
+def _move_radially(xy: Points, lens: RadialModel) -> Points:
+    """Pixels (..., 2) by a `RadialModel`; NaN outside its domain."""
+    points = np.ascontiguousarray(xy, dtype=np.float64)
+    rows = points.reshape(-1, 2)
     if lens.power == -0.5:  # its loop becomes vectors
         unit2 = lens.half_diagonal_px**2
-        return _divide_by_root(points, lens.polynomial[1], lens.centre_x_px, lens.centre_y_px, unit2)
-    return _scale_by_polynomial(points, lens)
-
-
-def _move_radially(xy: Points, model: RadialModel) -> Points:
-    points = np.ascontiguousarray(xy, dtype=np.float64)
-    return np.asarray(undistort(points.reshape(-1, 2), model).reshape(points.shape))
+        moved = _divide_by_root(rows, lens.polynomial[1], lens.centre_x_px, lens.centre_y_px, unit2)
+    else:
+        moved = _scale_by_polynomial(rows, lens)
+    return np.asarray(moved.reshape(points.shape))
 
 
 class _Radial:
@@ -132,7 +124,7 @@ class _Radial:
 
     @property
     def radial(self) -> RadialModel:
-        """The undistortion, for compiled code."""
+        """The undistortion."""
         raise NotImplementedError
 
     @property
@@ -191,7 +183,7 @@ class HarrisLens(_Radial):
 
     @cached_property
     def radial(self) -> RadialModel:
-        """The undistortion, for compiled code."""
+        """The undistortion."""
         return self._build_radial((1.0, -self.a), -0.5)
 
     @cached_property
@@ -231,7 +223,7 @@ class DivisionLens(_Radial):
 
     @cached_property
     def radial(self) -> RadialModel:
-        """The undistortion, for compiled code."""
+        """The undistortion."""
         # Pincushion distortion folds at k r_d^2 = -1; barrel distortion diverges where the divisor is zero.
         return self._build_radial((1.0, -self.k), -1.0, -1.0 / self.k if self.k < 0 else np.inf)
 
@@ -278,7 +270,7 @@ class PolynomialLens(_Radial):
 
     @cached_property
     def radial(self) -> RadialModel:
-        """The undistortion, for compiled code."""
+        """The undistortion."""
         return self._build_radial((1.0, *self.coefficients), 1.0, self.fold_radius() ** 2)
 
     def fold_radius(self) -> float:

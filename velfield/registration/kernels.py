@@ -1,58 +1,18 @@
 """Numba kernels of the raw-to-base map: rational function, row spline, displacement mesh.
 
-All take plain arrays, the map as a tuple of them. The map of one point, in order, is
+The map of one point, in order, is
 
     undistorted u, raw row y  ->  v = u + shift(y) + roll(y) x (u - c)  ->  P(v)  ->  + mesh(raw x, raw y)
 
-with P the rational function in normalised coordinates. ``tests/registration/test_transforms.py`` compares each kernel
-with its plain numpy form.
+with P the rational function in normalised coordinates.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from schemas.arrays import FloatArray, IntArray
-from velfield.camera.lens import RadialModel, undistort
 from velfield.compiled import compiled, kernel
-
-_INVERSE_STEPS = 25
-_TOLERANCE_PX = 1e-5
-_MAX_ERROR_PX = 1e-3
-"""Inverses of which the residual is not below the first are corrected; those not below the second in the end fail."""
-DIFFERENCE_PX = 0.25
-"""Step of the numerical derivative: small against the row spline's knot spacing, large against rounding errors."""
-
-
-class MapArrays(NamedTuple):
-    """The map of a frame, raw to base px."""
-
-    lens: RadialModel
-    width: int
-    height: int
-    rows: FloatArray
-    """(3, knots): coefficients as of `remove_row_motion`."""
-    centre: FloatArray
-    coefficients: FloatArray
-    """(3, 6), with ``source`` and ``target`` as of `rational`."""
-    source: FloatArray
-    target: FloatArray
-    mesh: FloatArray
-    """(my, mx, 2) as of `mesh_displacement`; (0, 0, 2) is no displacement."""
-    cell: int
-
-
-@compiled(error_model="numpy")
-def divide_by_third(linear: FloatArray, constant: FloatArray) -> FloatArray:
-    """Points (n, 2) of homogeneous ones, the sum of ``linear`` (n, 3) and a constant (3,); NaN where the third
-    coordinate has not the constant's sign."""
-    out, sign = np.empty((len(linear), 2)), np.sign(constant[2])
-    for i in range(len(linear)):
-        w = linear[i, 2] + constant[2]
-        w = w if w * sign > 1e-12 else np.nan
-        out[i, 0], out[i, 1] = (linear[i, 0] + constant[0]) / w, (linear[i, 1] + constant[1]) / w
-    return out
 
 
 @compiled(error_model="numpy")
@@ -98,33 +58,7 @@ def rational_jacobian(
 
 
 @compiled(error_model="numpy")
-def invert_plane(points, guess, coefficients, source, target, mesh, cell) -> FloatArray:  # type: ignore[no-untyped-def]
-    """Inverse of `rational` plus `mesh_displacement` at points (n, 2) from ``guess`` (n, 2); NaN where that fails.
-
-    By Newton's method with the Jacobian of `rational` alone, all points until the last is accurate: a mesh bends by far
-    less than a pixel a pixel. A mesh (0, 0, 2) is no displacement.
-    """
-    for step in range(_INVERSE_STEPS + 1):
-        mapped, largest = rational(guess, coefficients, source, target), 0.0
-        if mesh.shape[0] > 0:
-            mapped += mesh_displacement(guess, mesh, cell)
-        residual = points - mapped
-        for i in range(len(points)):
-            for c in range(2):
-                size = abs(residual[i, c])
-                largest = size if size > largest else largest
-        if largest < _TOLERANCE_PX or step == _INVERSE_STEPS:
-            break
-        guess = guess + _solve_all(rational_jacobian(guess, coefficients, source, target), residual)
-    out: FloatArray = guess.copy()
-    for i in range(len(points)):
-        if not (abs(residual[i, 0]) < _MAX_ERROR_PX and abs(residual[i, 1]) < _MAX_ERROR_PX):
-            out[i] = np.nan
-    return out
-
-
-@compiled(error_model="numpy")
-def _solve_all(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+def solve(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
     """Solve 2 x 2 systems (n, 2, 2) for residuals (n, 2) by Cramer's rule; not finite where one is singular."""
     out = np.empty((len(residual), 2))
     for i in range(len(residual)):
@@ -197,69 +131,3 @@ def mesh_displacement(points: FloatArray, mesh: FloatArray, cell: int) -> FloatA
             bottom = mesh[k1, j, c] + fx * (mesh[k1, j1, c] - mesh[k1, j, c])
             out[i, c] = top + fy * (bottom - top)
     return out
-
-
-@compiled(error_model="numpy")
-def to_base(raw: FloatArray, frame: MapArrays) -> FloatArray:
-    """Base px (n, 2) of raw points (n, 2) by `MapArrays`."""
-    undistorted = undistort(raw, frame.lens)
-    corrected = remove_row_motion(undistorted, raw[:, 1], frame.rows, frame.height, frame.centre)
-    out = rational(corrected, frame.coefficients, frame.source, frame.target)
-    if frame.mesh.shape[0] > 0:
-        out += mesh_displacement(raw, frame.mesh, frame.cell)
-    return out
-
-
-@kernel
-def _difference_jacobian(raw: FloatArray, mapped: FloatArray, frame: MapArrays) -> FloatArray:
-    """Jacobian (n, 2, 2) of `to_base` at raw points (n, 2), by differences from what they are mapped to."""
-    out, ahead = np.empty((len(raw), 2, 2)), raw.copy()
-    for axis in range(2):
-        ahead[:, axis] += DIFFERENCE_PX
-        moved = to_base(ahead, frame)
-        ahead[:, axis] = raw[:, axis]
-        for i in range(len(raw)):
-            for c in range(2):
-                out[i, c, axis] = (moved[i, c] - mapped[i, c]) / DIFFERENCE_PX
-    return out
-
-
-@kernel
-def _take_finite(points: FloatArray) -> IntArray:
-    """Numbers of the points (n, 2) that are finite."""
-    return np.flatnonzero(np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]))
-
-
-@kernel
-def to_raw(points: FloatArray, guess: FloatArray, frame: MapArrays, margin: float) -> FloatArray:
-    """Inverse of `to_base` at points (n, 2) by Newton's method from ``guess`` (n, 2), each point until it is accurate.
-
-    NaN rows where that fails, or the inverse lies outside the frame by more than ``margin``.
-    """
-    raw, error = guess.copy(), np.full(len(guess), np.nan)
-    todo = _take_finite(raw)
-    for step in range(_INVERSE_STEPS + 1):
-        here = raw[todo]
-        mapped, left = to_base(here, frame), 0
-        residual = np.empty((len(todo), 2))
-        for k in range(len(todo)):
-            at = todo[k]
-            x, y = points[at, 0] - mapped[k, 0], points[at, 1] - mapped[k, 1]
-            error[at] = max(abs(x), abs(y)) if x == x else np.nan  # both are NaN, or none
-            if error[at] > _TOLERANCE_PX:
-                todo[left], here[left], mapped[left] = at, here[k], mapped[k]
-                residual[left, 0], residual[left, 1] = x, y
-                left += 1
-        todo = todo[:left]
-        if not left or step == _INVERSE_STEPS:
-            break
-        change = _solve_all(_difference_jacobian(here[:left], mapped[:left], frame), residual[:left])
-        for k in range(left):
-            for c in range(2):
-                raw[todo[k], c] += change[k, c]
-    for i in range(len(raw)):
-        x, y = raw[i]
-        inside = x >= -margin and x <= frame.width + margin and y >= -margin and y <= frame.height + margin
-        if not (error[i] < _MAX_ERROR_PX and inside):
-            raw[i] = np.nan
-    return raw

@@ -3,6 +3,7 @@
 Paper: registration. Points are (n, 2) float64 as (x, y); pixel (0, 0) is the centre of the top-left pixel.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -13,7 +14,12 @@ from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.registration import kernels
 
-_NO_MESH = np.zeros((0, 0, 2))
+_INVERSE_STEPS = 25
+_TOLERANCE_PX = 1e-5
+_MAX_ERROR_PX = 1e-3
+"""Inverses of which the residual is not below the first are corrected; those not below the second in the end fail."""
+_DIFFERENCE_PX = 0.25
+"""Step of the numerical derivative: small against the row spline's knot spacing, large against rounding errors."""
 _OUTSIDE_FRACTION = 0.1
 _OUTSIDE_PX = 64.0
 """An inverse that lies farther outside the frame than both this and the fraction of its longer side is rejected."""
@@ -32,8 +38,9 @@ class HomographyTransform:
 
     def __call__(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2)."""
-        linear = as_points(xy) @ self.matrix[:, :2].T
-        return np.asarray(kernels.divide_by_third(linear, np.ascontiguousarray(self.matrix[:, 2])))
+        x, y, w = self.matrix[:, :2] @ as_points(xy).T + self.matrix[:, 2:]
+        w = np.where(w * np.sign(self.matrix[2, 2]) > 1e-12, w, np.nan)
+        return np.stack([x / w, y / w], axis=1)
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back, in closed form."""
@@ -101,8 +108,7 @@ class PolyprojectiveTransform:
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back by Newton's method from the homography's inverse; NaN rows where it fails."""
-        points, rational = as_points(xy), (self.coefficients, self.source, self.target)
-        return np.asarray(kernels.invert_plane(points, self.homography_inverse(points), *rational, _NO_MESH, 1))
+        return _invert(xy, self.homography_inverse(xy), self, lambda points, _: self.jacobian(points))
 
     def homography_inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back by the first-order terms alone."""
@@ -111,6 +117,31 @@ class PolyprojectiveTransform:
     @cached_property
     def _homography(self) -> HomographyTransform:
         return HomographyTransform(self.homography())
+
+
+def _invert(
+    xy: FloatArray,
+    guess: FloatArray,
+    forward: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray, FloatArray], FloatArray],
+) -> FloatArray:
+    """Inverse of a map at points (n, 2) by Newton's method from ``guess``, each until it is accurate; NaN where that
+    fails. ``jacobian`` (n, 2, 2) of points and what they are mapped to."""
+    points, found, error = as_points(xy), guess.copy(), np.full(len(guess), np.nan)
+    todo = np.flatnonzero(np.isfinite(found).all(axis=1))
+    for step in range(_INVERSE_STEPS + 1):
+        here = found[todo]
+        mapped = forward(here)
+        residual = points[todo] - mapped
+        error[todo] = np.maximum(*np.abs(residual.T))
+        far = np.flatnonzero(error[todo] > _TOLERANCE_PX)
+        if not len(far) or step == _INVERSE_STEPS:
+            break
+        if len(far) < len(todo):
+            todo, here, mapped, residual = todo[far], here[far], mapped[far], residual[far]
+        found[todo] = here + kernels.solve(jacobian(here, mapped), residual)
+    found[~(error < _MAX_ERROR_PX)] = np.nan
+    return found
 
 
 def normalisation_matrix(norm: FloatArray) -> FloatArray:
@@ -200,23 +231,10 @@ class FrameTransform:
 
     def to_base(self, xy_raw: FloatArray) -> FloatArray:
         """Raw pixels (n, 2) to base pixels (n, 2); NaN rows outside the domain of the lens or the polyprojective."""
-        return np.asarray(kernels.to_base(as_points(xy_raw), self._arrays))
-
-    @cached_property
-    def _arrays(self) -> kernels.MapArrays:
-        p = self.polyprojective
-        return kernels.MapArrays(
-            lens=self.lens.radial,
-            width=self.width,
-            height=self.height,
-            rows=np.ascontiguousarray(self.row_coefficients),
-            centre=self.centre,
-            coefficients=np.ascontiguousarray(p.coefficients),
-            source=np.ascontiguousarray(p.source),
-            target=np.ascontiguousarray(p.target),
-            mesh=_NO_MESH if self.mesh is None else np.ascontiguousarray(self.mesh),
-            cell=self.cell_size_px,
-        )
+        mapped = self.polyprojective(self.remove_row_motion(xy_raw))
+        if self.mesh is None:
+            return mapped
+        return np.asarray(mapped + kernels.mesh_displacement(as_points(xy_raw), self.mesh, self.cell_size_px))
 
     def to_raw(self, xy_base: FloatArray) -> FloatArray:
         """Base pixels (n, 2) to raw pixels (n, 2), by Newton's method to well below 1e-3 px.
@@ -224,10 +242,16 @@ class FrameTransform:
         NaN rows where there is no inverse, or where it lies outside the frame by more than a tenth of its size and
         more than 64 px.
         """
+
+        def jacobian(raw: FloatArray, mapped: FloatArray) -> FloatArray:
+            steps = _DIFFERENCE_PX * np.eye(2)
+            return np.stack([(self.to_base(raw + step) - mapped) / _DIFFERENCE_PX for step in steps], axis=2)
+
+        raw = _invert(xy_base, self.to_raw_roughly(xy_base), self.to_base, jacobian)
         margin = max(_OUTSIDE_PX, _OUTSIDE_FRACTION * max(self.width, self.height))
-        return np.asarray(
-            kernels.to_raw(as_points(xy_base), self.to_raw_roughly(xy_base), self._arrays, margin), np.float64
-        )
+        x, y = raw.T
+        raw[~((np.minimum(x, y) >= -margin) & (x <= self.width + margin) & (y <= self.height + margin))] = np.nan
+        return raw
 
     def to_raw_in_frame(self, xy_base: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `to_raw`, with the inverse Jacobian (n, 2, 2) there: what is needed to start a search from."""
@@ -245,8 +269,8 @@ class FrameTransform:
         columns = []
         for axis in range(2):
             step = np.zeros(2)
-            step[axis] = kernels.DIFFERENCE_PX
-            columns.append((self.to_base(raw + step) - self.to_base(raw - step)) / (2 * kernels.DIFFERENCE_PX))
+            step[axis] = _DIFFERENCE_PX
+            columns.append((self.to_base(raw + step) - self.to_base(raw - step)) / (2 * _DIFFERENCE_PX))
         return np.stack(columns, axis=2)
 
     def scale_and_rotation(self) -> tuple[float, float]:
@@ -329,11 +353,8 @@ class MeshedTransform:
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back; NaN rows where there is no inverse."""
-        points, p = as_points(xy), self.polyprojective
-        rational = p.coefficients, p.source, p.target
-        return np.asarray(
-            kernels.invert_plane(points, p.inverse(points), *rational, self.mesh, self.cell_size_px), np.float64
-        )
+        p = self.polyprojective  # a mesh bends by far less than a pixel a pixel
+        return _invert(xy, p.inverse(xy), self, lambda points, _: p.jacobian(points))
 
 
 PlaneTransform = PolyprojectiveTransform | MeshedTransform
