@@ -378,7 +378,7 @@ def test_a_model_that_finds_nothing_is_told_what_to_check(
     with pytest.raises(InputError, match=r"^the detector found no vehicle in \d+ frames, expected some, as the scale "):
         make_detector(plan)
     assert explain_no_tracklets(plan).endswith(
-        "and if not check the model's classes, threshold and input values (docs/detection.md#another-detector)"
+        "and if not check the model's classes, threshold and input values (documentation: Another detector)"
     )
 
 

@@ -119,7 +119,7 @@ def load_detector(path: Path) -> Detector:
     if path.suffix.lower() in _OTHER_FORMATS:
         raise InputError(
             f"{path}: found a model as {path.suffix}, expected .onnx (or a detector.json); export it as ONNX "
-            "(docs/detection.md#another-detector)"
+            "(documentation: Another detector)"
         )
     if path.stat().st_size > MAX_BYTES:
         raise InputError(

@@ -72,7 +72,7 @@ def device_limitations(device: Device) -> list[str]:
 
 
 _EXPECTED = "expected CUDA, cuDNN and an NVIDIA GPU"
-_REMEDY = "pip install velfield[cuda] as docs/scale.md says, or use --device cpu"
+_REMEDY = "pip install velfield[cuda], or use --device cpu"
 
 
 @cache

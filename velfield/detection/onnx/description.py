@@ -34,7 +34,7 @@ _COLUMNS: dict[OnnxLayout, int] = {
     "end_to_end_oriented": 7,
 }
 """Numbers for each box, without the scores of its classes."""
-_ASK = "describe it in a YAML file of the same name next to it (docs/detection.md)"
+_ASK = "describe it in a YAML file of the same name next to it (documentation: Another detector)"
 
 
 def describe_model(path: Path) -> OnnxRecord:
@@ -120,7 +120,7 @@ def check_output(
         wanted = f"(1, {expected}, n)" if axis == 1 else f"(1, n, {expected})"
         raise InputError(
             f"{name}: found an output of {sizes}, expected {wanted} of the layout {layout}; give its layout and all "
-            "its classes in a YAML file of the same name next to it (docs/detection.md)"
+            "its classes in a YAML file of the same name next to it (documentation: Another detector)"
         )
 
 

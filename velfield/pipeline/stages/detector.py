@@ -74,7 +74,7 @@ def _scale_of_boxes(plan: Plan, detector: Detector) -> float:
         raise InputError(
             f"the detector found no vehicle in {len(chosen)} frames, expected some, as the scale of the map comes from "
             "their size; check its classes, its threshold and the values that its input takes "
-            "(docs/detection.md#another-detector), or give --gsd-m"
+            "(documentation: Another detector), or give --gsd-m"
         )
     scale = _scale_of_length(plan, float(boxes["length_px"].median()), base_px_per_raw_px(plan))
     if scale is None:

@@ -41,7 +41,7 @@ def explain_no_tracklets(plan: Plan) -> str:
         inputs = plan.job.inputs
         remedy = "label one frame and give it with --labels"
         if (inputs.detector or "").lower().endswith(ONNX_SUFFIX):
-            remedy = "check the model's classes, threshold and input values (docs/detection.md#another-detector)"
+            remedy = "check the model's classes, threshold and input values (documentation: Another detector)"
         elif inputs.detections:
             remedy = "check the pixels and frames of --detections"
         return (

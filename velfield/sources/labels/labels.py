@@ -83,7 +83,7 @@ def read_labels(path: Path | str, info: SourceInfo) -> Labels:
     path
         CSV with the columns ``frame,x_px,y_px[,orientation_rad,length_px,width_px]`` in raw pixels, ``frame`` a
         image's file name or a video's 0-based index in the file; a row with ``x_px`` and ``y_px`` empty names a frame
-        without cars. Or a file of another program, or a folder of these (docs/detection.md#label-formats).
+        without cars. Or a file of another program, or a folder of these (documentation: Label formats).
     info
         The source.
 
