@@ -194,7 +194,7 @@ def _merges(
         at = traffic.passings(lane.number, place)
         source = _sources(vehicle[at.track], [vehicle[traffic.samples(k).track] for k in sources])
         known = source >= 0
-        source = _apart([graph.lanes[k].xy_m for k in sources], _APART_M + 2 * sd_m)[source]
+        source = _apart([graph.lanes[k].xy_m for k in sources], _APART_M + 3 * sd_m)[source]
         at = Passings(at.track[known], at.time_s[known], at.speed_m_per_s[known])
         out += _pairs("merging", at, source[known], lane.at(place), lengths, 0.0, threshold_s, sd_m)
     return out
