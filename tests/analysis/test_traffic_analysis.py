@@ -414,6 +414,9 @@ def test_roads_that_cross_are_an_intersection_where_turns_a_signal_or_pairs_show
     level = [drive(EAST, 12.0 * k) for k in range(40)] + [drive(SOUTH, 12.0 * k + 6.0) for k in range(40)]
     crossed = TrafficAnalysis(gather(level))
     assert [crossed.junction_kind(k) for k in range(len(crossed.lanes.junctions))] == ["intersection"]
+    compared = [change.what for change in find_changes(crossed, crossed) if "share" in change.what]
+    assert compared
+    assert all(", intersection at " in what for what in compared)
 
 
 def test_vehicles_that_cross_hardly_after_each_other_show_two_levels() -> None:

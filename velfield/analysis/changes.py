@@ -86,7 +86,7 @@ def _junctions(before: TrafficAnalysis, after: TrafficAnalysis) -> Iterator[Quan
     """Cycles, shares, flows, travel times and delays at junctions that both flights have."""
     for old, new in common_junctions(before, after):
         centre = old.junction.centre_m
-        name = f"{old.junction.kind} at {centre[0]:.0f}, {centre[1]:.0f} m"
+        name = f"{before.junction_kind(old.junction.number)} at {centre[0]:.0f}, {centre[1]:.0f} m"
         a, b = before.signals.get(old.junction.number), after.signals.get(new.junction.number)
         yield f"cycle, {name}", "s", centre, a.cycle_s if a else None, b.cycle_s if b else None
         known = {(m.arm_in, m.arm_out): m for m in new.movements}
