@@ -114,6 +114,7 @@ def test_comparison_finds_a_change_and_none_in_a_random_split(
     lines = compare_runs(*halves, tmp_path / "chance", min_count=2)
     assert sum("no significant change" in line for line in lines[:3]) >= 2, lines
     slow = field_run(tmp_path / "slow", slowed(table, 0.4), shape=shape).layout.root
+    assert "before_after.html" in lines[-1]
     lines = compare_runs(whole, slow, tmp_path / "change", min_count=2)
     assert "no significant" not in lines[1]
     assert "no significant" in lines[0]
@@ -128,6 +129,12 @@ def test_comparison_finds_a_change_and_none_in_a_random_split(
     fast = (before > 30) & np.isfinite(change)
     assert np.nanmedian(change[fast] / before[fast]) == pytest.approx(-0.6, abs=0.05)
     assert (chance[np.isfinite(chance)] >= 0).all()
+    merge_fields(halves, tmp_path / "sum")
+    lines = compare_runs(tmp_path / "sum", slow, tmp_path / "fields")
+    assert lines[-1].endswith(f"figures and change.tif in {tmp_path / 'fields'}")
+    assert sorted(path.name for path in (tmp_path / "fields").iterdir()) == [
+        "change.tif", "direction_change.png", "speed_change.png", "volume_change.png",
+    ]  # fmt: skip
     assert sorted(path.name for path in (tmp_path / "change").glob("*.png")) == [
         "direction_change.png",
         "speed_change.png",

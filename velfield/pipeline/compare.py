@@ -56,10 +56,12 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
         write_atomically(out / f"{name}_change.png", png_bytes(figure))
     _write_layers(out / "change.tif", changes, shown, runs[1])
     _show_in_the_viewer(changes, before, runs[1])
+    traffic = _traffic_lines(runs[0], runs[1], out)
+    written = "figures, tables and before_after.html" if traffic else "figures and change.tif"
     return [
         *(_line(name, changes[name], *shown[name]) for name in changes),
-        *_traffic_lines(runs[0], runs[1], out),
-        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures, tables and before_after.html in {out}",
+        *traffic,
+        f"significant: false discovery rate {FDR_LEVEL:.0%}; {written} in {out}",
     ]
 
 
