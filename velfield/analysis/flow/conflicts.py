@@ -114,7 +114,7 @@ def find_conflicts(
         for conflict in _post_encroachments(crossing, traffic, lengths, _NEAR_S, sd_m)
     ]
     found = _on_one_level(found, signalised_m)
-    # two that are at one place at once, beyond errors, are beside each other, or one
+    # Tracks that overlap by more than the position error are one vehicle, or side by side.
     found += [c for c in _merges(traffic, lengths, vehicles, _NEAR_S, sd_m) if c.value_s > -2 * c.sd_s]
     found += time_to_collision(trajectories, traffic.graph, lengths, _NEAR_S, (sd_m, speed_sd))
     return sorted(_closest(found), key=lambda c: c.time_s)

@@ -14,7 +14,7 @@ from velfield.report.traffic.diagrams import draw_turning
 from velfield.report.traffic.report import DPI, STYLE
 
 _UNITS = {"m/s": (3.6, "km/h"), "": (100.0, "%")}
-"""What is shown in place of a unit, and the factor; shares have none."""
+"""Displayed unit and factor, by unit; shares in per cent."""
 _WIDTH_IN, _HEIGHT_IN = 11.0, 4.4
 
 
