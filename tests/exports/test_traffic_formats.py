@@ -119,15 +119,6 @@ def test_utdf_holds_volumes_lanes_and_phases(analysis: TrafficAnalysis) -> None:
     assert nodes.loc[int(lanes.loc["Up Node", "SBT"]), "Y"] > nodes.loc[number, "Y"]  # y is up
 
 
-@pytest.mark.filterwarnings("ignore:Constructing a DataFrame")  # of the reader: lines are of unequal length
-def test_utdf2gmns_reads_the_volumes(analysis: TrafficAnalysis, tmp_path: Path) -> None:
-    reader = pytest.importorskip("utdf2gmns.func_lib.utdf.read_utdf")
-    (tmp_path / "UTDF.csv").write_text(utdf(analysis, height_m=100.0))
-    read = reader.read_UTDF(str(tmp_path / "UTDF.csv"))
-    volumes = read["Lanes"].set_index("RECORDNAME").loc[["Volume"], "EBT"].iloc[0]
-    assert float(volumes) * analysis.trajectories.duration_s / 3600 == pytest.approx(48, abs=1)
-
-
 def unpack_events(data: bytes) -> tuple[pd.DataFrame, pd.DataFrame]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         events, detectors = (pd.read_csv(io.BytesIO(archive.read(f"{n}.csv"))) for n in ("events", "detectors"))
@@ -152,18 +143,6 @@ def test_signal_events_are_those_of_the_signal(analysis: TrafficAnalysis) -> Non
     for red in reds:
         until = green[green > red].min()
         assert not crossed.between(red + pd.Timedelta(seconds=1), until).any()
-
-
-def test_atspm_counts_what_crosses_the_stop_lines(analysis: TrafficAnalysis, tmp_path: Path) -> None:
-    atspm = pytest.importorskip("atspm")
-    events, detectors = unpack_events(event_archive(analysis, datetime(2026, 5, 4, 7, 30, tzinfo=UTC)))
-    made = {"raw_data": events, "detector_config": detectors, "bin_size": 15, "output_dir": str(tmp_path)}
-    made |= {"output_format": "csv", "output_to_separate_folders": False, "verbose": 0}
-    asked = [{"name": "actuations", "params": {"fill_in_missing": False}}]
-    with atspm.SignalDataProcessor(**made, aggregations=asked) as processor:
-        processor.run()
-    counted = pd.concat(pd.read_csv(file) for file in tmp_path.rglob("*actuations*.csv"))
-    assert counted["Total"].sum() == (events["EventId"] == 82).sum()
 
 
 def ssam_vehicles(data: bytes) -> Iterator[tuple[float, tuple[float, ...]]]:

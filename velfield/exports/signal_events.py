@@ -1,7 +1,7 @@
 """Signals as a controller's event log with the Indiana enumerations, and its detectors: two CSV files, as ZIP.
 
-``events.csv`` (TimeStamp, DeviceId, EventId, Parameter) and ``detectors.csv`` (DeviceId, Phase, Parameter, Function)
-are what `atspm` reads. A device is a junction. Greens are those of the cycle that was found; yellow is not seen, and
+The columns of ``events.csv`` are TimeStamp, DeviceId, EventId and Parameter, those of ``detectors.csv`` DeviceId, Phase,
+Parameter and Function. A device is a junction. Greens are those of the cycle that was found; yellow is not seen, and
 red begins where crossings of the stop line end. A detector lies at the stop line of each lane.
 """
 
