@@ -118,10 +118,12 @@ def test_reading_a_damaged_table_raises_and_names_it(copy: Path) -> None:
         open_run(copy).detections()
 
 
-def test_missing_files_and_unfinished_units_are_listed(copy: Path) -> None:
+def test_missing_files_and_unfinished_units_are_listed(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (copy / "frames.zarr/raw/c/5/0/0").unlink()
     commit_path(RunLayout(copy), "tracklets", "000008-000015").unlink()
     assert found(copy) == {"frames.zarr/raw/c/5/0/0": "gone", "tracklets 000008-000015": "not finished"}
+    assert verify(copy) == 3
+    assert f"{copy}: 2 faults in 2 units" in capsys.readouterr().out
 
 
 def test_an_unfinished_run_is_not_called_damaged(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -129,7 +131,7 @@ def test_an_unfinished_run_is_not_called_damaged(copy: Path, capsys: pytest.Capt
         record.unlink()
     assert verify(copy) == 3
     output = capsys.readouterr().out
-    assert "what is there is whole; 1 units were never finished" in output
+    assert "what is there is whole; 1 unit never finished" in output
     assert "--repair" not in output
     assert f"velfield run ... --out {copy}" in output
 

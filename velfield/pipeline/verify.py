@@ -127,11 +127,12 @@ def describe_damage(root: Path, damages: Sequence[Damage]) -> str:
     """All damage, for people."""
     if not damages:
         return f"{root}: whole"
-    units = len({(damage.stage, damage.unit) for damage in damages})
+    n, units = len(damages), len({(damage.stage, damage.unit) for damage in damages})
+    of_units = f"{units} unit{'s' if units > 1 else ''}"
     lines = [damage.text() for damage in damages]
     if not has_damage(damages):
-        return "\n".join([*lines, f"{root}: what is there is whole; {units} units were never finished"])
-    return "\n".join([*lines, f"{root}: faults: {len(damages)}, units that they lie in: {units}"])
+        return "\n".join([*lines, f"{root}: what is there is whole; {of_units} never finished"])
+    return "\n".join([*lines, f"{root}: {n} fault{'s' if n > 1 else ''} in {of_units}"])
 
 
 def has_damage(damages: Sequence[Damage]) -> bool:
