@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.analysis.test_traffic_analysis import analysis
+from tests.analysis.test_traffic_analysis import analysis, in_two_clips
 from tests.field_runs import field_run, tracklets_along
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
@@ -117,6 +117,23 @@ def test_utdf_holds_volumes_lanes_and_phases(analysis: TrafficAnalysis) -> None:
     nodes = sections["Nodes"].set_index("INTID")
     assert nodes.loc[number, "TYPE"] == 0
     assert nodes.loc[int(lanes.loc["Up Node", "SBT"]), "Y"] > nodes.loc[number, "Y"]  # y is up
+
+
+def test_utdf_ends_greens_where_the_cycle_does_in_a_flight_of_two_clips() -> None:
+    """Most starts of queues are in the second clip, against which the signal is late in the first."""
+    late = in_two_clips(1013.0, 0.0, 180.0, 500.0)
+    (signal,) = (s for s in late.signals.values() if s.signalised)
+    assert signal.cycle_s is not None
+    rows = utdf_sections(utdf(late, height_m=100.0))["Phases"].query("INTID == @signal.junction + 1")
+    phases = rows.set_index("RECORDNAME")
+    for k, lanes in enumerate(signal.phases, start=1):
+        (stream,) = (s for s in signal.streams if s.stream.approach.lane in lanes)
+        assert stream.red_phase_s is not None
+        green = (stream.red_phase_s.value - stream.green_phase_s.value) % signal.cycle_s.value
+        assert 10.0 < green < 20.0
+        assert phases.loc["MaxGreen", f"D{k}"] == pytest.approx(green, abs=0.06)
+        end = (phases.loc["End", f"D{k}"] - phases.loc["Start", f"D{k}"]) % signal.cycle_s.value
+        assert end == pytest.approx(green, abs=0.11)
 
 
 def unpack_events(data: bytes) -> tuple[pd.DataFrame, pd.DataFrame]:

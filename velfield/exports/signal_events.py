@@ -1,8 +1,8 @@
 """Signals as a controller's event log with the Indiana enumerations, and its detectors: two CSV files, as ZIP.
 
-The columns of ``events.csv`` are TimeStamp, DeviceId, EventId and Parameter, those of ``detectors.csv`` DeviceId, Phase,
-Parameter and Function. A device is a junction. Greens are those of the cycle that was found; yellow is not seen, and
-red begins where crossings of the stop line end. A detector lies at the stop line of each lane.
+The columns of ``events.csv`` are TimeStamp, DeviceId, EventId and Parameter, those of ``detectors.csv`` DeviceId,
+Phase, Parameter and Function. A device is a junction. Greens are those of the cycle that was found; yellow is not seen,
+and red begins where crossings of the stop line end. A detector lies at the stop line of each lane.
 """
 
 import io
@@ -80,7 +80,8 @@ def _events(device: int, signal: JunctionSignal, analysis: TrafficAnalysis) -> I
     """Events of a junction: time, device, event and parameter."""
     for phase in range(1, len(signal.phases) + 1):
         streams = [stream for number, stream in _streams(signal) if number == phase]
-        for kind, times in ((GREEN, streams[0].green_s), (RED_CLEARANCE, red_onsets_s(streams, signal))):
+        green, lasts = streams[0].green_s, green_duration_s(streams, signal)
+        for kind, times in ((GREEN, green), (RED_CLEARANCE, green + lasts if lasts is not None else green[:0])):
             yield from ((t, device, kind, phase) for t in _seen(times, analysis))
     for _, stream in _streams(signal):
         s, channel = stream.stream, stream.stream.approach.lane + 1
@@ -89,11 +90,10 @@ def _events(device: int, signal: JunctionSignal, analysis: TrafficAnalysis) -> I
             yield from ((t, device, kind, channel) for t in times.tolist())
 
 
-def red_onsets_s(streams: list[StreamSignal], signal: JunctionSignal) -> FloatArray:
-    """Onset of red after each green of a phase: the last of its streams'; none where no stream's is known."""
+def green_duration_s(streams: list[StreamSignal], signal: JunctionSignal) -> float | None:
+    """Time from the onset of a phase's green to the last onset of red of its streams, s; None: no stream's is known."""
     cycle = signal.cycle_s.value if signal.cycle_s else np.nan
-    reds = [(s.red_phase_s.value - s.green_phase_s.value) % cycle for s in streams if s.red_phase_s]
-    return streams[0].green_s + max(reds) if reds else np.empty(0)
+    return max(((s.red_phase_s.value - s.green_phase_s.value) % cycle for s in streams if s.red_phase_s), default=None)
 
 
 def _seen(times_s: FloatArray, analysis: TrafficAnalysis) -> list[float]:

@@ -1,6 +1,7 @@
 """Junctions as Synchro's Universal Traffic Data Format, version 8: volumes, lanes and phases, in one CSV file.
 
-Each intersection and roundabout is a node, each of its arms an external node of its own. Distances are in metres.
+Each intersection and roundabout is a node, each of its arms an external node of its own. A node's INTID is the number
+of its junction + 1; its DESCRIPTION has the number itself. Distances are in metres.
 """
 
 from collections import defaultdict
@@ -17,7 +18,7 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import HEAVY
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
-from velfield.exports.signal_events import red_onsets_s
+from velfield.exports.signal_events import green_duration_s
 from velfield.run.run import Run
 
 FILE_NAME = "synchro.csv"
@@ -171,12 +172,13 @@ class _Node:
         cycle = self.signal.cycle_s.value
         start: list[float | None] = [None] * _PHASES
         end: list[float | None] = [None] * _PHASES
+        green: list[float | None] = [None] * _PHASES
         for k, lanes in enumerate(self.signal.phases[:_PHASES]):
             streams = [s for s in self.signal.streams if s.stream.approach.lane in lanes]
-            start[k] = round(streams[0].green_phase_s.value % cycle, 1)
-            reds = red_onsets_s(streams, self.signal)
-            end[k] = round(float(reds[0]) % cycle, 1) if len(reds) else None
-        green = [None if a is None or b is None else round((b - a) % cycle, 1) for a, b in zip(start, end, strict=True)]
+            onset, lasts = streams[0].green_phase_s.value, green_duration_s(streams, self.signal)
+            start[k] = round(onset % cycle, 1)
+            if lasts is not None:
+                green[k], end[k] = round(lasts, 1), round((onset + lasts) % cycle, 1)
         for name, values in (("MaxGreen", green), ("Start", start), ("End", end)):
             yield [name, self.number, *values]
 
