@@ -60,15 +60,17 @@ SOUTH = np.array([[150.0, 0.0], [150.0, 220.0]])
 RIGHT = corner(140.0, 100.0, 220.0)
 
 
-def crossroads() -> list[Track]:
-    """Twelve cycles: to the east green from 0 to 18 s of each, to the south from 20 to 38 s."""
+def crossroads(*, waits_s: float = 0.0) -> list[Track]:
+    """Twelve cycles: to the east green from 0 to 18 s of each, to the south from 20 to 38 s. In two of three the first
+    of each queue waits after green for the junction to clear."""
     out = []
     for cycle in range(12):
         begin = cycle * CYCLE_S
+        go = begin + 1.8 + (waits_s if cycle % 3 else 0.0)
         for k in range(4):  # a queue before each green, 7 m apart, 2 s apart
             path = RIGHT if k == 2 else EAST
-            out.append(drive(path, begin - 24 + 3 * k, stop_at_m=128.0 - 7 * k, go_s=begin + 1.8 * k + 1.8))
-            out.append(drive(SOUTH, begin - 4 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=begin + 20 + 1.8 * k + 1.8))
+            out.append(drive(path, begin - 24 + 3 * k, stop_at_m=128.0 - 7 * k, go_s=go + 1.8 * k))
+            out.append(drive(SOUTH, begin - 4 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=go + 20 + 1.8 * k))
         out.append(drive(EAST, begin + 1.0 + cycle % 3))
     return out
 
@@ -436,10 +438,12 @@ def test_few_pairs_that_cross_where_levels_are_not_clear_are_neither_conflicts_n
     assert sum(c.kind == "crossing" and c.probability > 0.5 for c in signalised) == 4
 
 
-def in_two_clips(second_s: float, begin_s: float, cut_s: float, end_s: float) -> TrafficAnalysis:
+def in_two_clips(
+    second_s: float, begin_s: float, cut_s: float, end_s: float, *, waits_s: float = 0.0
+) -> TrafficAnalysis:
     """The crossroads as two clips, cut at ``cut_s``, of which the second is later by ``second_s``."""
     tracks = []
-    for times, xy in crossroads():
+    for times, xy in crossroads(waits_s=waits_s):
         for rows, later in ((times >= begin_s) & (times < cut_s), 0.0), ((times >= cut_s) & (times < end_s), second_s):
             if rows.sum() > 2:
                 tracks.append((times[rows] + later, xy[rows]))
@@ -460,6 +464,16 @@ def test_a_signal_is_found_in_both_clips_though_the_gap_is_no_whole_number_of_cy
         assert stream.red_phase_s is not None
     growth = [g for g in queue_growth(signal) if g.vehicles]
     assert max(g.vehicles.value for g in growth if g.vehicles) == pytest.approx(4, abs=0.3)
+
+
+def test_waits_of_first_vehicles_do_not_make_the_greens_of_the_other_clip_late() -> None:
+    """The second clip is later by 25 cycles. The green is before the earliest starts, 1.3 s before the mean one."""
+    analysis = in_two_clips(25 * CYCLE_S, 0.0, 250.0, 500.0, waits_s=2.0)
+    (signal,) = (s for s in analysis.signals.values() if s.signalised)
+    for stream in signal.streams:
+        phases = (stream.green_s - stream.green_s[0] + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
+        first, second = (phases[(stream.green_s < 250.0) == of_first].mean() for of_first in (True, False))
+        assert second == pytest.approx(first, abs=0.5)
 
 
 def test_clips_that_hold_no_two_cycles_give_none_together() -> None:

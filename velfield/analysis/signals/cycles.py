@@ -8,7 +8,7 @@ from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
-from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
+from velfield.analysis.signals.phases import fit_phases
 from velfield.analysis.signals.queues import Stream
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
@@ -141,7 +141,7 @@ def find_signal(junction: int, streams: Sequence[Stream], observed_s: FloatArray
         return JunctionSignal(junction, None, reason, None, (), ())
     estimate, phases = fit_phases(events, cycle, time_sd_s=max(stream.stop_time_sd_s for stream in used))
     greens = {used[k].approach.lane: phase.green_s for phase in phases for k in phase.streams}
-    late = [0.0 if k == main else _late_s(found, greens, estimate.value) for k, found in enumerate(by_time)]
+    late = _late_s([_after_green(found, greens) for found in by_time], main, estimate.value)
     seen_late = [(seen, by) for seen, by in zip(observed_s, late, strict=True) if by is not None]
     signals = [_stream_signal(used[k], phase.green_s, estimate, seen_late) for phase in phases for k in phase.streams]
     lanes = tuple(tuple(sorted(used[k].approach.lane for k in phase.streams)) for phase in phases)
@@ -162,14 +162,22 @@ def _within(times_s: FloatArray, begin_s: float, end_s: float) -> FloatArray:
     return times_s[(times_s >= begin_s) & (times_s <= end_s)]
 
 
-def _late_s(found: Sequence[tuple[Stream, FloatArray]], greens: Mapping[int, Estimate], cycle_s: float) -> float | None:
-    """By how much the signal is later in another time than by its cycle, by starts of queues in it; None: these do not
-    show it."""
-    after = [times - greens[s.approach.lane].value - START_DELAY_S for s, times in found if s.approach.lane in greens]
-    if sum(map(len, after)) < _JUNCTION_STARTS:
-        return None
-    mean = complex(np.exp(2j * np.pi * np.concatenate(after) / cycle_s).mean())
-    return float(np.angle(mean) / (2 * np.pi) * cycle_s) if abs(mean) >= _MIN_CONCENTRATION else None
+def _after_green(found: Sequence[tuple[Stream, FloatArray]], greens: Mapping[int, Estimate]) -> FloatArray:
+    """Times (n,) of starts of queues after the first green of their stream."""
+    after = [times - greens[s.approach.lane].value for s, times in found if s.approach.lane in greens]
+    return np.concatenate(after) if after else np.empty(0)
+
+
+def _late_s(after_s: Sequence[FloatArray], main: int, cycle_s: float) -> list[float | None]:
+    """By how much the signal is later in each of the times than by its cycle in the main one, 0 there; None: the starts
+    of queues in it do not show it. Mean starts are compared with mean starts: some wait for the junction to clear."""
+    means = [np.exp(2j * np.pi * after / cycle_s).mean() if len(after) else 0j for after in after_s]
+    return [
+        float(np.angle(mean * np.conj(means[main])) / (2 * np.pi) * cycle_s)
+        if k == main or (len(after) >= _JUNCTION_STARTS and abs(mean) >= _MIN_CONCENTRATION)
+        else None
+        for k, (mean, after) in enumerate(zip(means, after_s, strict=True))
+    ]
 
 
 def _queue_heads(stream: Stream) -> FloatArray:
