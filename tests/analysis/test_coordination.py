@@ -50,7 +50,7 @@ def test_a_queue_grows_in_red_as_vehicles_come(analysis: TrafficAnalysis) -> Non
 
 
 def test_the_offset_of_two_signals_on_one_road(pair: TrafficAnalysis) -> None:
-    offsets, reason = find_offsets(pair.signals, pair.lanes)
+    offsets, reason = find_offsets(pair.signals, pair.lanes, pair.trajectories.observed_s)
     assert reason == ""
     # to the east alone: nobody drives the other way, and the roads to the south are beside each other
     (only,) = offsets
@@ -60,8 +60,35 @@ def test_the_offset_of_two_signals_on_one_road(pair: TrafficAnalysis) -> None:
     assert len(offset_table(pair).rows) == 1
 
 
+def two_clips(*, seen_in_both: bool) -> TrafficAnalysis:
+    """The pair in two clips, the second 1013 s later, no whole number of cycles. Most starts of the first junction are
+    in the first clip, those of the second in the second; all, unless they are seen in both."""
+    tracks = []
+    for times, xy in crossroads():
+        for shift_m, shift_s, main in ((0.0, 0.0, 0), (300.0, 12.0, 1)):
+            at = times + shift_s
+            for clip, rows in enumerate((at < 250.0, at >= 250.0)):
+                seen = clip == main or (seen_in_both and (at[0] if clip == 0 else 500.0 - at[0]) > 80.0)
+                if rows.sum() > 2 and seen:
+                    tracks.append((at[rows] + 1013.0 * clip, xy[rows] + np.array([shift_m, 0.0])))
+    return TrafficAnalysis(replace(gather(tracks), gaps_s=np.array([[250.0, 1263.0]])))
+
+
+def test_the_offset_is_that_of_greens_in_one_clip() -> None:
+    analysis = two_clips(seen_in_both=True)
+    (only,) = find_offsets(analysis.signals, analysis.lanes, analysis.trajectories.observed_s)[0]
+    assert (only.offset_s.value + 20) % CYCLE_S - 20 == pytest.approx(12.0, abs=1.0)
+
+
+def test_no_clip_that_shows_both_signals_gives_no_offset() -> None:
+    analysis = two_clips(seen_in_both=False)
+    assert sum(bool(signal.signalised) for signal in analysis.signals.values()) == 2
+    offsets, reason = find_offsets(analysis.signals, analysis.lanes, analysis.trajectories.observed_s)
+    assert (offsets, reason) == ([], "None: no clip shows the greens of both of two successive junctions.")
+
+
 def test_no_coordination_is_reported_as_such(analysis: TrafficAnalysis, pair: TrafficAnalysis) -> None:
-    assert find_offsets(analysis.signals, analysis.lanes) == (
+    assert find_offsets(analysis.signals, analysis.lanes, analysis.trajectories.observed_s) == (
         [],
         "No offsets: 1 junction with a signal of a fixed cycle.",
     )
@@ -70,7 +97,7 @@ def test_no_coordination_is_reported_as_such(analysis: TrafficAnalysis, pair: Tr
     cycle = pair.signals[second].cycle_s
     assert cycle is not None
     other = dict(pair.signals) | {second: replace(pair.signals[second], cycle_s=cycle.in_units(1.5))}
-    offsets, reason = find_offsets(other, pair.lanes)
+    offsets, reason = find_offsets(other, pair.lanes, pair.trajectories.observed_s)
     assert offsets == []
     assert reason == "None: the signals have cycles of their own, 40, 60 s."
     assert first != second

@@ -6,6 +6,7 @@ from itertools import permutations
 
 import numpy as np
 
+from schemas.arrays import FloatArray
 from velfield.analysis.intervals import Estimate, estimate_mean
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.signals.cycles import JunctionSignal, StreamSignal, queues
@@ -66,11 +67,20 @@ def queue_growth(signal: JunctionSignal) -> list[QueueGrowth]:
     return out
 
 
-def find_offsets(signals: Mapping[int, JunctionSignal], graph: LaneGraph) -> tuple[list[Offset], str]:
-    """Offsets between signals of one cycle, and why there are none."""
+def find_offsets(
+    signals: Mapping[int, JunctionSignal], graph: LaneGraph, observed_s: FloatArray
+) -> tuple[list[Offset], str]:
+    """Offsets between signals of one cycle, and why there are none.
+
+    Parameters
+    ----------
+    observed_s
+        (k, 2) begins and ends of the clips: greens are compared within one, as signals may be late in others.
+    """
     known = [(signal, signal.cycle_s) for signal in signals.values() if signal.signalised and signal.cycle_s]
     if len(known) < 2:
         return [], f"No offsets: {len(known)} junction{'' if len(known) == 1 else 's'} with a signal of a fixed cycle."
+    follow = False
     out, cycles = [], sorted({round(cycle.value, 1) for _, cycle in known})
     for (a, cycle_a), (b, cycle_b) in permutations(known, 2):
         if cycle_a.low > cycle_b.high or cycle_b.low > cycle_a.high:
@@ -78,11 +88,18 @@ def find_offsets(signals: Mapping[int, JunctionSignal], graph: LaneGraph) -> tup
         for first in a.streams:
             for second in b.streams:
                 distance = _leads_to(first, second, graph, a.junction, b.junction)
-                if distance is not None:
-                    cycle = cycle_a if cycle_a.n >= cycle_b.n else cycle_b
-                    out.append(_offset(first, second, a.junction, b.junction, distance, cycle))
+                if distance is None:
+                    continue
+                follow = True
+                cycle = cycle_a if cycle_a.n >= cycle_b.n else cycle_b
+                offset = _offset_s(first, second, cycle.value, observed_s)
+                if offset is not None:
+                    lanes = first.stream.approach.lane, second.stream.approach.lane
+                    out.append(Offset(a.junction, b.junction, *lanes, distance, cycle, offset))
     if out:
         return out, ""
+    if follow:
+        return [], "None: no clip shows the greens of both of two successive junctions."
     if len(cycles) > 1:
         return [], f"None: the signals have cycles of their own, {', '.join(f'{c:g}' for c in cycles)} s."
     return [], "None: no signal follows another on one road."
@@ -103,10 +120,17 @@ def _leads_to(first: StreamSignal, second: StreamSignal, graph: LaneGraph, a: in
     return ahead if turn < _SAME_RAD and 0 < ahead < _REACH_M and aside < _ASIDE_M else None
 
 
-def _offset(first: StreamSignal, second: StreamSignal, a: int, b: int, distance_m: float, cycle: Estimate) -> Offset:
+def _offset_s(first: StreamSignal, second: StreamSignal, cycle_s: float, observed_s: FloatArray) -> Estimate | None:
+    """Time from a green of the first stream to one of the second, in the clip with most of both; None: in none."""
+    by_clip = [
+        [s.green_s[(s.green_s >= begin) & (s.green_s <= end)] for s in (first, second)] for begin, end in observed_s
+    ]
+    before, after = max(by_clip, key=lambda greens: min(map(len, greens)))
+    if not (len(before) and len(after)):
+        return None
+    apart = after[:, None] - before
+    nearest = apart[np.arange(len(after)), np.abs(apart).argmin(axis=1)]
+    value = float(np.angle(np.exp(2j * np.pi * nearest / cycle_s).mean()) / (2 * np.pi) * cycle_s) % cycle_s
     x, y = first.green_phase_s, second.green_phase_s
-    value = (y.value - x.value) % cycle.value
     half = float(np.hypot((x.high - x.low) / 2, (y.high - y.low) / 2))
-    estimate = Estimate(value, value - half, value + half, min(x.n, y.n))
-    lanes = first.stream.approach.lane, second.stream.approach.lane
-    return Offset(a, b, *lanes, distance_m, cycle, estimate)
+    return Estimate(value, value - half, value + half, min(x.n, y.n))

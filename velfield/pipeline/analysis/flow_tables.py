@@ -92,7 +92,7 @@ def offset_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("cycle", "Cycle", "s", lambda o: o.cycle_s),
         estimates("offset", "Offset of green", "s", lambda o: o.offset_s),
     ]
-    offsets, reason = find_offsets(analysis.signals, analysis.lanes)
+    offsets, reason = find_offsets(analysis.signals, analysis.lanes, analysis.trajectories.observed_s)
     note = reason or "Of junctions whose cycles agree within their intervals, from the green of the one to the next's."
 
     def place(o: Offset) -> GeometryRecord:
