@@ -58,7 +58,8 @@ def resample_kernel(
         below = (j + 0.5) / step + 0.5
         runs[j], across[j] = int(below), below - int(below)
     lines = np.empty((CELL_PX // step + 2, 2), np.float32)
-    x, y, part_x, part_y = np.empty((4, CELL_PX * CELL_PX), np.float32)
+    # zeros: pixels of a cell beyond the image's right edge get no position, but are sampled with the others
+    x, y, part_x, part_y = np.zeros((4, CELL_PX * CELL_PX), np.float32)
     at, first, second, third, fourth = np.empty((5, CELL_PX * CELL_PX), np.int32)
     levels, inside = np.empty(CELL_PX * CELL_PX, np.uint8), np.empty(CELL_PX * CELL_PX, np.bool_)
     for n in range(len(cells)):
