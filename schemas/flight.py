@@ -152,6 +152,9 @@ class TrackingConfig(Model):
     """The same for a vehicle that stands, or stops and sets off again, in the gap."""
     max_hidden_gap_s: float = Field(15.0, ge=0)
     """The same for a vehicle that creeps under trees, say, where its lane, order and looks determine which it is."""
+    doubt: bool = True
+    """Set aside what stands far from vehicles with a low score: roof gear, sheds. Read with the scores of the network
+    alone, not with those of the paper's detector, an ONNX model, or given boxes."""
 
     @model_validator(mode="after")
     def _has_moving_vehicles(self) -> Self:
@@ -270,7 +273,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
             "cell_size_px": 200,
         },
         "detection": {"method": "paper"},
-        "tracking": {"refine": False, "linking": "pairwise", "min_confidence": 0.0},
+        "tracking": {"refine": False, "linking": "pairwise", "min_confidence": 0.0, "doubt": False},
         "field": {"path_width": "pixel", "shared_segment_weight": 2, "velocity_span_s": 0.0},
     },
 }

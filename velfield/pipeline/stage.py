@@ -115,6 +115,7 @@ class Stage:
         return {name: value for name, value in found.items() if name not in self.unread}
 
 
+_OF_TRACKS = ("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s", "tracking.doubt")
 STAGES: tuple[Stage, ...] = (
     # Decode, measure and write each frame.
     Stage(
@@ -269,25 +270,25 @@ STAGES: tuple[Stage, ...] = (
         unit=f"{_STAGES}.tracklets:link_unit",
         after=("detections",),
         config=("tracking",),
-        unread=("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s"),
+        unread=_OF_TRACKS,
         cut=Cut.BY_FRAMES,
         new_base=NewBase.COUNTS,
     ),
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=15,
+        version=16,
         label="tracks",
         lines=(
             Line(
-                "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets, {recovered:.0f} of them recovered",
-                lambda counts: bool(counts.get("recovered")),
+                "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets, {doubtful:.0f} doubtful ones set aside",
+                lambda counts: bool(counts.get("doubtful")),
             ),
             Line("{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets"),
         ),
         unit=f"{_STAGES}.tracks:chain_tracks",
         after=("tracklets",),
-        config=("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s"),
+        config=_OF_TRACKS,
         new_workers=True,
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_tracks",

@@ -181,6 +181,7 @@ class RunLayout:
     """Where each track's vehicle was in each frame, by unit."""
     doubtful = _Inside("tracks/doubtful")
     """Tracklets of doubtful tracks, by unit: what is probably no vehicle is in none of the other tables of tracks."""
+    doubtful_positions = _Inside("tracks/doubtful/positions")
     joins = _Inside("tracks/joins.parquet")
     """Joins of tracks over a gap, with their probabilities."""
     tracklets = _Inside("tracklets")

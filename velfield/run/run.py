@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage, Mask, Points
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask, Points
 from schemas.georeference import FlightStart
 from schemas.records import FlightRecord, GridRecord
 from schemas.tables import (
@@ -203,8 +203,9 @@ class Run:
         found = self._all_detections(list(DETECTION_COLUMNS))
         if doubtful:
             return found
-        apart = self._tracklets_of(self.layout.doubtful, [f"detection_id_{k}" for k in range(3)])
-        return found[~found["detection_id"].isin(np.unique(apart.to_numpy()))].reset_index(drop=True)
+        return found[~found["detection_id"].isin(self._detections_in(self.layout.doubtful_positions))].reset_index(
+            drop=True
+        )
 
     def _all_detections(self, names: list[str]) -> pd.DataFrame:
         self.require_frames()
@@ -212,10 +213,14 @@ class Run:
             read_tables(sorted(folder.glob("unit-*.parquet")), DETECTION_COLUMNS, only=names)
             for folder in (self.layout.detections, self.layout.weak_detections)
         )
-        paths = sorted(self.layout.track_positions.glob("unit-*.parquet"))
-        seen = read_tables(paths, TRACK_POSITION_COLUMNS, only=["detection_id"])["detection_id"]
-        confirmed = weak[weak["detection_id"].isin(seen)]
+        seen = [self._detections_in(at) for at in (self.layout.track_positions, self.layout.doubtful_positions)]
+        confirmed = weak[weak["detection_id"].isin(np.concatenate(seen))]
         return pd.concat([sure, confirmed]).sort_values("detection_id", ignore_index=True) if len(confirmed) else sure
+
+    def _detections_in(self, positions: Path) -> IntArray:
+        """Ids of the detections in a folder of positions."""
+        table = read_tables(sorted(positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS, only=["detection_id"])
+        return table["detection_id"].to_numpy(np.int64)
 
     def tracklets(self) -> pd.DataFrame:
         """All tracklets, in base pixels: the columns of ``schemas.tables.TRACK_COLUMNS``."""

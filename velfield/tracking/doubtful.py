@@ -10,13 +10,14 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.flight import STATIONARY_SPEED_M_PER_S
 
 MOVED_M = 2.0
 """A displacement of half a car's length is no error of its position."""
 _ENDS = 3
 """Positions averaged at each end of a track that has twice as many; of a shorter one fewer."""
 _STANDS_M = 1.0
-"""A thing that may have moved farther is not doubted."""
+"""A thing that may have moved farther, or faster than what is stationary, is not doubted."""
 _MIN_TRAFFIC = 10
 """Fewer moving vehicles do not tell the usual score."""
 _DRIVEN_M = 6.0
@@ -50,13 +51,14 @@ def find_doubtful(positions: pd.DataFrame, score: pd.Series, metres: float) -> I
     between = end_means(table, last=True) - end_means(table, last=False)
     displacement_m = np.hypot(*between[["x_px", "y_px"]].to_numpy(np.float64).T) * metres
     moved = displacement_m > MOVED_M
+    speed_m_per_s = displacement_m / np.maximum(between["time_s"].to_numpy(np.float64), 1e-9)
     usual = float(np.median(scores[moved])) if moved.sum() >= _MIN_TRAFFIC else 0.0
     if usual <= 0:
         return np.empty(0, np.int64)
     moving = np.repeat(moved, groups.size().to_numpy())
     driven_m = table.loc[moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres
     cells = np.unique(np.rint(driven_m), axis=0)  # of 1 m: a long flight has many positions
-    stands = displacement_m < _STANDS_M
+    stands = (displacement_m < _STANDS_M) & (speed_m_per_s < STATIONARY_SPEED_M_PER_S)
     at_road = cKDTree(cells).query(xy_m)[0] < _DRIVEN_M
     distance_m = _distances_to_others(xy_m, scores >= usual)
     least = np.minimum(_LEAST + _SLOPE * np.log1p(distance_m / _SCALE_M), _ENOUGH)

@@ -221,20 +221,29 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
 
 def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     """Map all tracklets, unit by unit."""
-    transform, written, tracks, count = polyprojective_from_record(rebase.record.transform), [], set[int](), 0
-    for old, new in ((rebase.old.tracks, plan.layout.tracks), (rebase.old.doubtful, plan.layout.doubtful)):
+    transform, written, layout, before = (
+        polyprojective_from_record(rebase.record.transform),
+        [],
+        plan.layout,
+        rebase.old,
+    )
+    tracks, doubtful, count = set[int](), set[int](), 0
+    for old, new, found in ((before.tracks, layout.tracks, tracks), (before.doubtful, layout.doubtful, doubtful)):
         for source in sorted(old.glob("unit-*.parquet")):
             table = map_tracklets(read_tables([source], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
             written.append(new / source.name)
             write_tracks(written[-1], table)
-            if old == rebase.old.tracks:
-                tracks.update(table["track_id"].unique().tolist())
-                count += len(table)
-    for source in sorted(rebase.old.track_positions.glob("unit-*.parquet")):
-        table = read_tables([source], TRACK_POSITION_COLUMNS)
-        table[["x_px", "y_px"]] = transform(table[["x_px", "y_px"]].to_numpy(np.float64))
-        written.append(plan.layout.track_positions / source.name)
-        write_table(written[-1], table, TRACK_POSITION_COLUMNS)
+            found.update(table["track_id"].unique().tolist())
+            count += len(table) if found is tracks else 0
+    for old, new in (
+        (before.track_positions, layout.track_positions),
+        (before.doubtful_positions, layout.doubtful_positions),
+    ):
+        for source in sorted(old.glob("unit-*.parquet")):
+            table = read_tables([source], TRACK_POSITION_COLUMNS)
+            table[["x_px", "y_px"]] = transform(table[["x_px", "y_px"]].to_numpy(np.float64))
+            written.append(new / source.name)
+            write_table(written[-1], table, TRACK_POSITION_COLUMNS)
     if rebase.old.dimensions.exists():
         table = read_tables([rebase.old.dimensions], DIMENSION_COLUMNS)
         sizes = ["length_px", "length_sd_px", "width_px", "width_sd_px"]
@@ -244,7 +253,9 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     if rebase.old.joins.exists():
         written.append(link_file(rebase.old.joins, plan.layout.joins))
     advance("tracks")
-    return StageResult(written, {"tracklets": float(count), "tracks": float(len(tracks))})
+    return StageResult(
+        written, {"tracklets": float(count), "tracks": float(len(tracks)), "doubtful": float(len(doubtful))}
+    )
 
 
 def map_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:

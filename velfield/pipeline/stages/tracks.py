@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from threading import Lock
 
@@ -11,6 +12,7 @@ import pandas as pd
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import assumed_gsd_m
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
+from velfield.detection.registry import load_detector
 from velfield.parallel import parallel_map, usable_processors
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
@@ -26,6 +28,7 @@ from velfield.pipeline.stages.tracklets import (
     tracklet_files,
 )
 from velfield.run.frame_transforms import FrameTransforms, read_tracking_gsd
+from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_arrays, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
@@ -86,18 +89,21 @@ def chain_tracks(plan: Plan) -> StageResult:
         found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
-    doubtful = find_doubtful(positions[positions["source"] < 2], mean_scores(plan, positions), gsd_m)
+    doubtful = np.empty(0, np.int64)
+    if plan.config.tracking.doubt and _has_network(layout):
+        doubtful = find_doubtful(positions[positions["source"] < 2], mean_scores(plan, positions), gsd_m)
+    apart = positions[positions["track_id"].isin(doubtful)].reset_index(drop=True)
     positions = _without(positions, doubtful)
     images = images_of_tracks(strips, found.tracks)
     del strips
     triples = find_triples(positions, flight, plan.config.tracking.max_interval_s)
     track = found.tracks[chain]
-    output = _Output(plan, first_frame, track, positions, flight, triples, np.unique(triples.ids), doubles, doubtful)
+    output = _Output(plan, first_frame, track, positions, apart, flight, triples, np.unique(triples.ids), doubles)
     count = min(usable_processors(), _AT_ONCE, len(plan.units))
     runs = np.array_split(np.arange(len(plan.units)), max(count, 1))
     parts = parallel_map(output.write, [run for run in runs if len(run)])
     written, recovered = [path for paths, _ in parts for path in paths], sum(number for _, number in parts)
-    for folder in (layout.tracks, layout.track_positions, layout.doubtful):
+    for folder in (layout.tracks, layout.track_positions, layout.doubtful, layout.doubtful_positions):
         for stale in set(folder.glob("unit-*.parquet")) - set(written):
             stale.unlink()  # of an earlier plan with more units
     for path, table, columns in (
@@ -152,6 +158,11 @@ def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candi
         position_m=table[["x_px", "y_px"]].to_numpy(np.float64) * metres,
         axis_rad=table["orientation_rad"].to_numpy(np.float64),
     )
+
+
+def _has_network(layout: RunLayout) -> bool:
+    """Whether the scores are those of the network: `find_doubtful` was set on these."""
+    return layout.detector.exists() and load_detector(layout.detector).method == "cnn"
 
 
 def mean_scores(plan: Plan, positions: pd.DataFrame) -> pd.Series:
@@ -336,18 +347,24 @@ class _Output:
     """Writes the tables of units.
 
     ``first_frame`` and ``track`` (n,) of the tracklets of all units, by frame; ``positions`` by frame, without
-    the tracks that are ``doubles`` or ``doubtful``; ``triples``, and the ``ids`` (m,) of their detections, ascending.
+    the tracks that are ``doubles``, those that are ``doubtful`` ``apart``; ``triples``, and the ``ids`` (m,) of their
+    detections, ascending.
     """
 
     plan: Plan
     first_frame: IntArray
     track: IntArray
     positions: pd.DataFrame
+    apart: pd.DataFrame
     flight: _Frames
     triples: _Triples
     ids: IntArray
     doubles: IntArray
-    doubtful: IntArray
+
+    @cached_property
+    def doubtful(self) -> IntArray:
+        """Tracks that are set apart, ascending."""
+        return np.unique(self.apart["track_id"].to_numpy(np.int64))
 
     def write(self, units: IntArray) -> tuple[list[Path], int]:
         """The files of consecutive units, and how many tracklets in them only tracks confirm.
@@ -382,9 +399,10 @@ class _Output:
             table = table.sort_values(["frame_0", "tracklet_id"], kind="stable", ignore_index=True)
             written.append(layout.tracks / path.name)
             write_tracks(written[-1], table)
-        rows = slice(*np.searchsorted(self.positions["frame"].to_numpy(), [frames.start, frames.stop]))
-        written.append(layout.unit_file(layout.track_positions, unit))
-        write_table(written[-1], self.positions[rows], TRACK_POSITION_COLUMNS)
+        for folder, positions in ((layout.track_positions, self.positions), (layout.doubtful_positions, self.apart)):
+            rows = slice(*np.searchsorted(positions["frame"].to_numpy(), [frames.start, frames.stop]))
+            written.append(layout.unit_file(folder, unit))
+            write_table(written[-1], positions[rows], TRACK_POSITION_COLUMNS)
         return written, recovered
 
     def _recovered(self, unit: int, kept: dict[int, UnitDetections]) -> pd.DataFrame:

@@ -1,0 +1,36 @@
+"""A doubtful thing is in one table of a run; detections are read with it and without."""
+
+import shutil
+from pathlib import Path
+
+import pandas as pd
+
+from schemas.summary import RunSummary
+from tests.small_flight import job
+from velfield import open_run
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import make_plan
+
+
+def ids(table: pd.DataFrame, name: str = "track_id") -> set[int]:
+    return set(table[name].tolist())
+
+
+def test_a_doubtful_thing_is_set_apart_and_kept_where_none_is_to_be_doubted(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    run = open_run(whole[0])
+    vehicles = run.vehicles()
+    doubtful = ids(vehicles[vehicles["doubtful"]])
+    assert doubtful
+    assert ids(run.tracklets()) == ids(run.track_positions()) == ids(vehicles) - doubtful
+    every, sure = run.detections(doubtful=True), run.detections()
+    its = ids(every, "detection_id") - ids(sure, "detection_id")
+    assert doubtful <= its  # a track is named after its first detection
+    assert not its & ids(run.track_positions(), "detection_id")
+    shutil.copytree(whole[0], tmp_path / "run")
+    compute_stages(make_plan(job(flight, tmp_path / "run", "tracking.doubt=false")), ["tracks"])
+    again = open_run(tmp_path / "run")
+    assert not again.vehicles()["doubtful"].any()
+    assert doubtful <= ids(again.tracklets())
+    assert ids(again.detections(), "detection_id") == ids(every, "detection_id")
