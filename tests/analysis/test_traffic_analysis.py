@@ -101,6 +101,20 @@ def test_turning_counts_and_shares(analysis: TrafficAnalysis) -> None:
     assert found["N", "S"].delay_s is None
 
 
+def test_a_vehicle_that_stands_for_most_of_a_clip_does_not_outweigh_the_others() -> None:
+    """Eleven vehicles of 6 s and one of 49 s in a clip of 60 s: 9.6 s in the mean, 12 s with those that were cut."""
+    tracks = [drive(EAST, 3.5 * k - 3.0) for k in range(11)] + [drive(EAST, -2.0, stop_at_m=131.0, go_s=49.0)]
+    tracks += [drive(RIGHT, 3.5 * k - 1.0) for k in range(5)] + [drive(SOUTH, 4.0 * k + 1.5) for k in range(8)]
+    in_clip = ((times, xy, (times >= 0.0) & (times < 60.0)) for times, xy in tracks)
+    analysis = TrafficAnalysis(gather([(times[rows], xy[rows]) for times, xy, rows in in_clip]))
+    found = {(m.arm_in, m.arm_out): m for j in analysis.movements for m in j.movements}
+    travel = found["W", "E"].travel_time_s
+    assert travel is not None
+    assert travel.n == 12
+    assert 9.6 < travel.value < 13.0
+    assert travel.low < 9.6
+
+
 def test_a_tree_that_cuts_one_movement_leaves_shares_and_counts_as_they_are() -> None:
     cut: list[Track] = []
     for k, (times, xy) in enumerate(crossroads()):

@@ -30,6 +30,9 @@ _MIN_PASSES, _MIN_DELAYED, _MIN_FREE = 3, 10, 3
 """Fewest vehicles of a movement; of which the delay is known; and of these that do not stop."""
 _WAITS_S = 1.5
 """A vehicle that needs longer for a metre has stopped."""
+_LEAST_SEEN = 0.5
+"""A vehicle that could be seen in whole in less than this fraction of the time weighs as one of this fraction: else one
+that stands for most of a clip outweighs all others."""
 _SPREAD_N = 8
 """The standard deviation of all travel times through a junction counts for so many of a movement's vehicles: five may
 all have come at green."""
@@ -261,8 +264,8 @@ def _delay(
     """Travel time of a movement, and its delay against the fastest tenth of its vehicles that do not stop; no delay
     where hardly any passes without a stop."""
     # Those that take long are more often cut by the begin and the end of the time that is seen.
-    seen = np.maximum(np.maximum(np.diff(observed_s, axis=1) - time_s, 0.0).sum(axis=0), 1.0)
-    weight = seen.mean() / seen if len(seen) else seen
+    clip_s = np.diff(observed_s, axis=1)
+    weight = 1 / np.maximum(np.maximum(clip_s - time_s, 0.0).sum(axis=0) / clip_s.sum(), _LEAST_SEEN)
     weight = weight / weight.mean() if len(weight) else weight
     mean = float((weight * time_s).mean()) if len(time_s) else 0.0
     travel = estimate_mean(mean + weight * (time_s - mean), begin_s, spread=spread)
