@@ -68,9 +68,10 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
 
 
 def page_address(report: Path) -> str:
-    """Address of the page under `velfield serve`; else of the file, which browsers open only by hand."""
+    """Address of the page under `velfield serve`; else of the file, which browsers open only by hand, or of the
+    object on S3."""
     served = os.environ.get(PAGES_OF)
-    if served is not None and report.resolve().is_relative_to(Path(served).resolve()):
+    if served is not None and not is_remote(report) and report.resolve().is_relative_to(Path(served).resolve()):
         return f"{os.environ[PAGES]}/{report.resolve().relative_to(Path(served).resolve()).as_posix()}"
     return report.as_uri()
 

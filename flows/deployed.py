@@ -14,7 +14,7 @@ from flows.runners import RunnerConfig, read_runner
 from velfield.errors import InputError
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.watch import find_image, inputs_of, newest_image, run_folders, run_name
-from velfield.run.layout import RunLayout
+from velfield.run.layout import RunLayout, to_path
 
 if TYPE_CHECKING:
     from schemas.job import Job
@@ -30,7 +30,7 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
         A video, a folder of images, or a folder with `frames/` or a video, and beside it the optional inputs of
         `velfield run`: `base.*`, `labels.csv`, `timestamps.csv`, `detector.json`, `flight.yaml`.
     runs
-        Folder of run folders.
+        Folder of run folders, which may be on ``s3://``.
     cluster
         Cluster file, as for `velfield run --cluster`. Default: the threads of this process.
     """
@@ -55,7 +55,7 @@ def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", c
     Parameters
     ----------
     runs
-        Folder of run folders.
+        Folder of run folders, which may be on ``s3://``.
     base_images
         Folder that base images arrive in; no other is read.
     base
@@ -72,7 +72,7 @@ def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", c
         logger.info("no base image has arrived in %s", base_images)
         return []
     made, refused = [], []
-    for root in run_folders(Path(runs), run):
+    for root in run_folders(to_path(runs), run):
         try:
             folder, _ = run_reprocess(root, image, runner=_runner(cluster), console=Console("quiet"))
             made.append(str(folder))

@@ -23,12 +23,15 @@ import psutil
 import pytest
 import yaml
 
-from flows.deployed import process_dropped
+from flows.artifacts import page_address
+from flows.deployed import process_dropped, reprocess_runs
+from flows.launch import PAGES, PAGES_OF
 from flows.serve import ServeConfig, check, deployments, settings, watching
 from schemas.summary import RunSummary
 from tests.browser import browser
 from velfield.errors import InputError
 from velfield.pipeline.watch import FolderWatcher, find_image, inputs_of, newest_image, run_folders, run_name
+from velfield.run.layout import to_path
 
 ROOT = Path(__file__).resolve().parents[2]
 AUTH = "somebody:secret"
@@ -89,6 +92,25 @@ def test_a_flight_that_fails_says_so_in_the_terminal(
     with pytest.raises(InputError, match="does not exist"):
         process_dropped(str(tmp_path / "street.mp4"), str(tmp_path / "runs"))
     assert f"street.mp4 failed: {tmp_path / 'street.mp4'} does not exist" in capsys.readouterr().out
+
+
+def test_the_page_of_a_run_on_s3_has_an_address_while_other_pages_are_served(
+    s3: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PAGES_OF, str(tmp_path))
+    monkeypatch.setenv(PAGES, "http://127.0.0.1:4280")
+    assert page_address(tmp_path / "street/index.html") == "http://127.0.0.1:4280/street/index.html"
+    address = "s3://flights/runs/street/index.html"
+    assert page_address(to_path(address)) == address
+
+
+def test_runs_on_s3_are_found_for_a_new_base_image(server: None, s3: None, tmp_path: Path) -> None:
+    runs = "s3://flights/runs-of-serve"
+    for name in ("flight.json", "index.html"):
+        (to_path(runs) / "street" / name).write_bytes(b"")
+    (tmp_path / "base.png").write_bytes(b"")
+    with pytest.raises(InputError, match="the runs are street"):
+        reprocess_runs(runs, str(tmp_path), run="another")
 
 
 def test_all_addresses_with_a_password(tmp_path: Path) -> None:
