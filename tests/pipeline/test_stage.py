@@ -98,6 +98,7 @@ READERS: dict[str, tuple[str, ...]] = {
     "tracking.max_gap_s": ("tracks",),
     "tracking.max_stationary_gap_s": ("tracks",),
     "tracking.max_hidden_gap_s": ("tracks",),
+    "tracking.doubt": ("tracks",),
     "field": ("field",),
     "work": (),
     "work.unit_frames": ("frames",),
