@@ -203,9 +203,8 @@ class Run:
         found = self._all_detections(list(DETECTION_COLUMNS))
         if doubtful:
             return found
-        return found[~found["detection_id"].isin(self._detections_in(self.layout.doubtful_positions))].reset_index(
-            drop=True
-        )
+        apart = found["detection_id"].isin(self._detections_in(self.layout.doubtful_positions))
+        return found[~apart].reset_index(drop=True)
 
     def _all_detections(self, names: list[str]) -> pd.DataFrame:
         self.require_frames()
@@ -265,9 +264,8 @@ class Run:
     def segments(self) -> Segments:
         """Vehicles from one frame to the next, each once: by track and time (`velfield.field.segments`)."""
         config = self.record.config.field.model_copy(update=_EACH_ONCE)
-        return segment_table(
-            self._tracklets_of(self.layout.tracks, SEGMENT_COLUMNS), config
-        )  # unnamed, so that it is soon free
+        # The tracklets are unnamed, so that they are soon free.
+        return segment_table(self._tracklets_of(self.layout.tracks, SEGMENT_COLUMNS), config)
 
     def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:
         """Crossings of the line between two base pixels by vehicles: `find_crossings`."""

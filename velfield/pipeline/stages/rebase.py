@@ -221,28 +221,25 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
 
 def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     """Map all tracklets, unit by unit."""
-    transform, written, layout, before = (
-        polyprojective_from_record(rebase.record.transform),
-        [],
-        plan.layout,
-        rebase.old,
-    )
-    tracks, doubtful, count = set[int](), set[int](), 0
-    for old, new, found in ((before.tracks, layout.tracks, tracks), (before.doubtful, layout.doubtful, doubtful)):
-        for source in sorted(old.glob("unit-*.parquet")):
-            table = map_tracklets(read_tables([source], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
-            written.append(new / source.name)
+    transform, written = polyprojective_from_record(rebase.record.transform), list[Path]()
+    old, layout = rebase.old, plan.layout
+    ids, counts = {}, {}
+    for name, source, target in (("tracks", old.tracks, layout.tracks), ("doubtful", old.doubtful, layout.doubtful)):
+        ids[name], counts[name] = set[int](), 0
+        for path in sorted(source.glob("unit-*.parquet")):
+            table = map_tracklets(read_tables([path], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
+            written.append(target / path.name)
             write_tracks(written[-1], table)
-            found.update(table["track_id"].unique().tolist())
-            count += len(table) if found is tracks else 0
-    for old, new in (
-        (before.track_positions, layout.track_positions),
-        (before.doubtful_positions, layout.doubtful_positions),
+            ids[name].update(table["track_id"].unique().tolist())
+            counts[name] += len(table)
+    for source, target in (
+        (old.track_positions, layout.track_positions),
+        (old.doubtful_positions, layout.doubtful_positions),
     ):
-        for source in sorted(old.glob("unit-*.parquet")):
-            table = read_tables([source], TRACK_POSITION_COLUMNS)
+        for path in sorted(source.glob("unit-*.parquet")):
+            table = read_tables([path], TRACK_POSITION_COLUMNS)
             table[["x_px", "y_px"]] = transform(table[["x_px", "y_px"]].to_numpy(np.float64))
-            written.append(new / source.name)
+            written.append(target / path.name)
             write_table(written[-1], table, TRACK_POSITION_COLUMNS)
     if rebase.old.dimensions.exists():
         table = read_tables([rebase.old.dimensions], DIMENSION_COLUMNS)
@@ -253,9 +250,8 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     if rebase.old.joins.exists():
         written.append(link_file(rebase.old.joins, plan.layout.joins))
     advance("tracks")
-    return StageResult(
-        written, {"tracklets": float(count), "tracks": float(len(tracks)), "doubtful": float(len(doubtful))}
-    )
+    found = {name: float(len(known)) for name, known in ids.items()}
+    return StageResult(written, found | {"tracklets": float(counts["tracks"])})
 
 
 def map_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:

@@ -91,7 +91,9 @@ def chain_tracks(plan: Plan) -> StageResult:
     positions = _without(positions, doubles)
     doubtful = np.empty(0, np.int64)
     if plan.config.tracking.doubt and _has_network(layout):
-        doubtful = find_doubtful(positions[positions["source"] < 2], mean_scores(plan, positions), gsd_m)
+        seen = positions[positions["source"] < 2]
+        doubtful = find_doubtful(seen, mean_scores(plan, seen), gsd_m)
+        del seen
     apart = positions[positions["track_id"].isin(doubtful)].reset_index(drop=True)
     positions = _without(positions, doubtful)
     images = images_of_tracks(strips, found.tracks)
@@ -165,9 +167,9 @@ def _has_network(layout: RunLayout) -> bool:
     return layout.detector.exists() and load_detector(layout.detector).method == "cnn"
 
 
-def mean_scores(plan: Plan, positions: pd.DataFrame) -> pd.Series:
-    """Mean score of the detections of each track, by ``track_id``."""
-    seen = positions.loc[positions["source"] < 2, ["track_id", "detection_id"]].sort_values("detection_id")
+def mean_scores(plan: Plan, seen: pd.DataFrame) -> pd.Series:
+    """Mean score of each track's detections, ``track_id, detection_id``, by ``track_id``."""
+    seen = seen[["track_id", "detection_id"]].sort_values("detection_id")
     ids, track = seen["detection_id"].to_numpy(np.int64), seen["track_id"].to_numpy(np.int64)
 
     def read(path: Path) -> pd.DataFrame:
