@@ -1,5 +1,6 @@
 """The ``velfield`` command. Imports nothing heavy until a command runs."""
 
+import gc
 import os
 import sys
 import warnings
@@ -143,6 +144,7 @@ def main() -> None:
             raise
         print(f"velfield: S3: {_explain_s3(error)}", file=sys.stderr)
         status = BAD_INPUT
+    gc.freeze()  # what is left goes with the process: to look through it takes a second
     sys.exit(status)
 
 

@@ -14,13 +14,8 @@ from flows.runners import Runner
 from flows.work import UnderWay, is_long
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.preview import (
-    FIELD_STAGES,
-    make_first_preview,
-    preview_finished_units,
-    publish_first_preview,
-)
 from velfield.pipeline.result import committed
+from velfield.pipeline.stage import FIELD_STAGES
 from velfield.pipeline.units import WHOLE
 from velfield.run.layout import is_remote
 
@@ -79,11 +74,15 @@ class Previews:
         return left_s >= max(WORTH_S, TIMES_ITS_COST * self._cost_s) and not committed(found.plan, "tracks", WHOLE)
 
     def _show_first_frames(self) -> int:
+        from velfield.pipeline.preview import make_first_preview, publish_first_preview  # all that the stages import
+
         frames = self.runner.call(make_first_preview, self.plan)
         publish_first_preview(self.plan, self._while_wanted())
         return frames
 
     def _show_finished_units(self, plan: Plan) -> int:
+        from velfield.pipeline.preview import preview_finished_units
+
         return preview_finished_units(plan, self._compute, self._while_wanted())
 
     def _make(self, preview: Callable[[], int]) -> None:

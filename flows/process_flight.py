@@ -25,7 +25,6 @@ from velfield.errors import InputError
 from velfield.pipeline.check_inputs import validate_inputs
 from velfield.pipeline.estimate import check_space, disk_full_as_input_error
 from velfield.pipeline.plan import Plan, changed_since, dropped_inputs, make_plan, write_flight_record
-from velfield.pipeline.stages.report import write_report
 from velfield.pipeline.summary import summarise_run
 from velfield.run.commits import sweep_partial
 from velfield.run.layout import RunLayout, is_remote, remove_tree
@@ -114,6 +113,8 @@ def record_start(plan: Plan, what: str, console: Console) -> None:
 
 def publish_report(plan: Plan, summary: RunSummary, runner: Runner, console: Console, by: Orchestration) -> None:
     """Write the page and the report, print the warnings, and show the summary."""
+    from velfield.pipeline.stages.report import write_report  # 1 s, which the first frame need not await
+
     for note in runner.call(write_report, plan, summary):  # it reads whole tables
         console.warn_at_end(note)
     console.print_warnings()

@@ -19,7 +19,7 @@ from schemas.simulation import SimulationConfig
 from tests.small_flight import job
 from velfield.errors import InputError
 from velfield.parallel import count_steps
-from velfield.pipeline import check_inputs
+from velfield.pipeline import check_inputs, given_files
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import dropped_inputs, make_plan, write_flight_record
@@ -162,13 +162,13 @@ def test_a_wrong_base_image_is_refused_before_a_frame_is_stored(
     checked: list[object] = []
     plans = {name: make_plan(job(flight, tmp_path / "run", base=str(path))) for name, path in bases.items()}
     monkeypatch.setattr(check_inputs, "_LONG_PX", 1)
-    check_inputs.check_base_area(make_plan(job(flight, tmp_path / "run")))
-    check_inputs.check_base_area(plans["turned"])
+    given_files.check_base_area(make_plan(job(flight, tmp_path / "run")))
+    given_files.check_base_area(plans["turned"])
     for name, found in {"mirrored": "found a mirrored image", "town": _ELSEWHERE, "noise": _ELSEWHERE}.items():
         with pytest.raises(InputError, match=rf"--base .*{name}\.png: {found}") as caught:
             check_inputs.validate_inputs(plans[name])
         assert "\n" not in str(caught.value)
-    monkeypatch.setattr(check_inputs, "check_base_area", checked.append)
+    monkeypatch.setattr(given_files, "check_base_area", checked.append)
     monkeypatch.setattr(check_inputs, "_LONG_PX", 10**9)
     check_inputs.validate_inputs(plans["mirrored"])
     assert checked == []

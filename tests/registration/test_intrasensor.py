@@ -265,9 +265,7 @@ def test_own_base_image_serves_as_well_as_a_given_one() -> None:
     lens = lens_of(flight)
     greys = [flight.frame(k) for k in range(6)]
     keypoints = {k: detect_keypoints(grey, CONFIG) for k, grey in enumerate(greys)}
-    own = build_own_base(
-        greys.__getitem__, keypoints.__getitem__, range(6), reference=4, lens=lens, config=CONFIG, threads=2
-    )
+    own = build_own_base(greys.__getitem__, keypoints.__getitem__, range(6), reference=4, lens=lens, config=CONFIG)
     assert own
     assert own.frames == 6
     base = prepare_base(own.image, CONFIG, mask=own.valid, frame_shape=greys[0].shape)

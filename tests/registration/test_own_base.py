@@ -83,7 +83,7 @@ def mosaic() -> tuple[np.ndarray, tuple[tuple[int, int], np.ndarray, np.ndarray]
         frames[frame] = grey
         points = ControlPoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
         registered[frame] = (shift(x - 30.0, y - 40.0), points)
-    return ground, own_base._build_mosaic(frames.__getitem__, registered, GRID, np.zeros((3, 0)), threads=2)
+    return ground, own_base._build_mosaic(frames.__getitem__, registered, GRID, np.zeros((3, 0)))
 
 
 def test_the_mosaic_is_the_ground_without_vehicles(

@@ -6,9 +6,8 @@ that of the parabola. Arcs of a higher curvature than a lens can cause are dropp
 left to the robust fit.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,9 +15,8 @@ from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.compiled import kernel
+from velfield.parallel import parallel_map
 
-Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""Applies a function to each of several things, as `map` does: one that uses several threads is faster."""
 _MIN_POINTS_PER_ARC, _MAX_POINTS_PER_ARC = 10, 24  # after pooling
 
 
@@ -291,15 +289,15 @@ def detect_arcs(
 
 
 def detect_arcs_of_frames(
-    frames: Sequence[GreyImage], *, min_length_px: float, max_curvature_per_px: float, apply: Apply = map
+    frames: Sequence[GreyImage], *, min_length_px: float, max_curvature_per_px: float
 ) -> list[Arcs]:
-    """Arcs of each frame, numbered in their order; the parameters are those of `detect_arcs` and `Apply`."""
+    """Arcs of each frame, numbered in their order; the parameters are those of `detect_arcs`."""
 
     def detect(numbered: tuple[int, GreyImage]) -> Arcs:
         number, frame = numbered
         return detect_arcs(frame, frame=number, min_length_px=min_length_px, max_curvature_per_px=max_curvature_per_px)
 
-    return list(apply(detect, enumerate(frames)))
+    return parallel_map(detect, enumerate(frames))
 
 
 def pool_arcs(parts: list[Arcs], *, max_points: int) -> Arcs:

@@ -21,13 +21,14 @@ from scipy.optimize import minimize
 from schemas.arrays import FloatArray, GreyImage
 from schemas.camera import CameraRecord, ModelEvidence
 from schemas.flight import LensConfig
-from velfield.camera.edges import Apply, Arcs, detect_arcs_of_frames, pool_arcs
+from velfield.camera.edges import Arcs, detect_arcs_of_frames, pool_arcs
 from velfield.camera.entropy import hough_entropy
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.camera.lines import LineSet, line_residuals, line_rms, merge_collinear_arcs
 from velfield.camera.straighten import LensFamily, PlumbLineFit, RadialLens, cv_rms, fit_lens
 from velfield.camera.vanishing_points import refine_by_vanishing_points
 from velfield.errors import InputError
+from velfield.parallel import parallel_map
 
 MIN_LINES = 30
 """Smallest number of straight lines."""
@@ -145,9 +146,7 @@ class _EdgeData:
         )
 
 
-def calibrate(
-    frames: Sequence[GreyImage], config: LensConfig, seed: int = 0, *, apply: Apply = map
-) -> CalibrationResult:
+def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) -> CalibrationResult:
     """Estimate the lens from frames of one camera.
 
     Parameters
@@ -158,8 +157,6 @@ def calibrate(
         The lens section of the flight's configuration.
     seed
         Seed of the cross-validation folds and of the vanishing points.
-    apply
-        Applies a function to every frame.
 
     Returns
     -------
@@ -174,7 +171,7 @@ def calibrate(
     shape = _common_shape(frames)
     if config.calibrate == "never":
         return CalibrationResult(pinhole(shape), False, "calibration is switched off", shape)
-    data = _EdgeData(shape, _detect_and_pool(frames, shape, config, apply), config.angle_bins)
+    data = _EdgeData(shape, _detect_and_pool(frames, shape, config), config.angle_bins)
     count = data.arcs.length_px.size
     if count < MIN_LINES:
         reason = f"{count} straight edges in {len(frames)} frames, {MIN_LINES} needed"
@@ -227,13 +224,12 @@ def _common_shape(frames: Sequence[GreyImage]) -> tuple[int, int]:
     return height, width
 
 
-def _detect_and_pool(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig, apply: Apply) -> Arcs:
+def _detect_and_pool(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig) -> Arcs:
     half_diagonal = pinhole(shape).half_diagonal_px
     parts = detect_arcs_of_frames(
         frames,
         min_length_px=max(24.0, _ARC_FRACTION * 2.0 * half_diagonal),
         max_curvature_per_px=2.0 / half_diagonal,
-        apply=apply,
     )
     return pool_arcs(parts, max_points=config.max_edge_points)
 
@@ -248,7 +244,7 @@ def _search_distortion(data: _EdgeData, max_distortion: float) -> tuple[FloatArr
     def entropy(parameters: FloatArray) -> float:
         return data.entropy(family.lens(parameters), thinned)
 
-    values = np.array([entropy(np.array([a, 0.0, 0.0])) for a in grid])
+    values = np.array(parallel_map(lambda a: entropy(np.array([a, 0.0, 0.0])), grid))
     start = np.array([grid[int(np.argmin(values))], 0.0, 0.0])
     # The initial simplex opens towards zero distortion: the other direction may leave the model's domain.
     towards = -1.0 if start[0] > 0 else 1.0
@@ -290,7 +286,7 @@ def _select_model(
     # All models are compared on one set of lines, merged under one of them: lines merged under a model favour it.
     division = fit_lens(data.lines(harris.lens, 2.0), families[1], starts[1])
     lines = data.lines(division.lens, 1.5)
-    fits = [fit_lens(lines, family, start) for family, start in zip(families, starts, strict=True)]
+    fits = parallel_map(lambda model: fit_lens(lines, *model), zip(families, starts, strict=True))
     models = [(data.family("harris", 0), np.zeros(3)), *((fit.family, fit.parameters) for fit in fits)]
     rms = cv_rms(lines, models, folds=_FOLDS, seed=seed)
     rms = np.where(np.isfinite(rms), rms, np.inf)

@@ -17,6 +17,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from velfield.camera.lens import DivisionLens, HarrisLens, Lens, PolynomialLens
 from velfield.camera.lines import LineSet, line_residuals, line_rms
+from velfield.parallel import parallel_map
 
 RadialLens = HarrisLens | DivisionLens | PolynomialLens
 
@@ -208,9 +209,12 @@ def cv_rms(lines: LineSet, families: Sequence[tuple[LensFamily, FloatArray]], *,
     """Cross-validated RMS of each line, (models, lines) px, with the same folds for every model."""
     fold = np.random.default_rng(seed).permutation(lines.count) % folds
     rms = np.zeros((len(families), lines.count))
-    for part in range(folds):
+
+    def validate(part: int) -> None:
         training, validation = lines.select(fold != part), lines.select(fold == part)
         for number, (family, start) in enumerate(families):
             lens: Lens = fit_lens(training, family, start).lens if family.terms else family.lens(start)
             rms[number, fold == part] = line_rms(validation, line_residuals(validation, lens))
+
+    parallel_map(validate, range(folds))
     return rms

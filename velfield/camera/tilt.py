@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from schemas.arrays import FloatArray, GreyImage, IntArray
-from velfield.camera.edges import Apply, Arcs, detect_arcs_of_frames, pool_arcs
+from velfield.camera.edges import Arcs, detect_arcs_of_frames, pool_arcs
 from velfield.camera.lens import Lens
 
 MIN_GAIN_NATS = 0.1
@@ -63,18 +63,14 @@ class Tilt:
         return self.gain_nats >= MIN_GAIN_NATS and MIN_CONVERGENCE <= size < _END
 
 
-def tilt_of_frames(frames: Sequence[GreyImage], lens: Lens, *, apply: Apply = map) -> Tilt | None:
-    """Estimate the perspective of the ground from frames (h, w) uint8 of one camera; None: they show too few lines.
-
-    ``apply`` applies a function to every frame.
-    """
+def tilt_of_frames(frames: Sequence[GreyImage], lens: Lens) -> Tilt | None:
+    """Estimate the perspective of the ground from frames (h, w) uint8 of one camera; None: they show too few lines."""
     shape = (frames[0].shape[0], frames[0].shape[1])
     diagonal_px = float(np.hypot(*shape))
     parts = detect_arcs_of_frames(
         frames,
         min_length_px=max(24.0, _ARC_FRACTION * diagonal_px),
         max_curvature_per_px=_MAX_CURVATURE / diagonal_px,
-        apply=apply,
     )
     return estimate_tilt(pool_arcs(parts, max_points=_MAX_POINTS), lens, shape)
 

@@ -16,6 +16,7 @@ from schemas.detector import DetectorConfig
 from velfield.detection.crops import oriented_strips
 from velfield.detection.frame import half_resolution
 from velfield.detection.interface import Detector
+from velfield.parallel import parallel_map
 
 STEP = 1.25
 """Ratio of two scales of the scan: the network finds cars that are a quarter larger or smaller too."""
@@ -138,21 +139,20 @@ def spread_windows(width: int, height: int, area: float) -> list[Window]:
 def _search(views: Iterable[View], detector: Detector, measure: Measure) -> _Finds:
     """Detect cars in all views, and measure them."""
     car_px = float(detector.record.working_car_length_px)
-    scores, lengths, sizes, area = [np.empty(0)], [np.empty(0)], [np.empty(0, bool)], 0
-    for image, valid in views:
-        area += int(valid.sum())
+
+    def find(view: View) -> tuple[int, FloatArray, FloatArray, Mask]:
+        image, valid = view
         cars = detector.detect(image, valid)
-        if not len(cars):
-            continue
         strips = oriented_strips(half_resolution(image), cars.xy, cars.orientation_rad)
         length, length_sd, width = measure(np.asarray(strips, np.float64))
         is_car = length_sd < _MAX_SD * length
         for values, (low, high) in ((length, _LENGTHS), (width, _WIDTHS)):
             is_car &= (values > low * car_px) & (values < high * car_px)
-        scores.append(cars.score)
-        lengths.append(length)
-        sizes.append(is_car)
-    score, length, is_car = np.concatenate(scores), np.concatenate(lengths), np.concatenate(sizes)
+        return int(valid.sum()), cars.score, length, np.asarray(is_car)
+
+    found = parallel_map(find, views)
+    area = sum(view[0] for view in found)
+    score, length, is_car = (np.concatenate([np.empty(0, bool), *(view[k] for view in found)]) for k in (1, 2, 3))
     if not len(score):
         return _Finds(0, 0.0, 0.0, length)
     agreement = float(np.sort(score)[-_TOP:].mean() * is_car.mean())

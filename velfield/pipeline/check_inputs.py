@@ -1,38 +1,15 @@
 """Optional inputs are read before any work: a bad file is reported at once, not an hour later."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from schemas.arrays import GreyImage
-from velfield.camera.lens import pinhole
-from velfield.detection.interface import Detector
-from velfield.detection.registry import load_detector
-from velfield.errors import Failure, InputError
+from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut
-from velfield.pipeline.stages.labels import rescale
 from velfield.pipeline.units import WHOLE
-from velfield.registration.intersensor import MIRRORED, IntersensorResult, register_intersensor
-from velfield.sources.geo import read_base_raster
-from velfield.sources.labels.labels import read_detections, read_labels
-from velfield.sources.quality import UNUSABLE
-from velfield.sources.source import iter_frames
-from velfield.sources.telemetry.read import read_telemetry_file
 
-_CHECKED_SIDE_PX = 960
-_TRIED_FRAMES = 5
 _LONG_PX = 50_000_000
 """Pixels of all frames above which decoding them takes longer than the check of the base image."""
-
-_READ: dict[str, Callable[[Path, Plan], object]] = {
-    "base": lambda path, plan: read_base_raster(path, plan.config.frames),
-    "labels": lambda path, plan: read_labels(path, plan.info),
-    "detector": lambda path, plan: _read_detector(path, plan),
-    "detections": lambda path, plan: read_detections(path, plan.info),
-    "telemetry": lambda path, plan: read_telemetry_file(path, plan.info),
-}
 
 
 def validate_inputs(plan: Plan) -> None:
@@ -47,67 +24,20 @@ def validate_inputs(plan: Plan) -> None:
         from velfield.detection.runtime import check_device
 
         check_device("cuda")
-    for option, read in _READ.items():
-        path = getattr(plan.job.inputs, option)
-        if path and _is_pending(plan, option):
-            try:
-                read(Path(path), plan)
-            except InputError as error:
-                raise InputError(f"--{option}: {error}") from None
+    options = ("base", "labels", "detector", "detections", "telemetry")
+    pending = [name for name in options if getattr(plan.job.inputs, name) and _is_pending(plan, name)]
+    if not pending:
+        return
+    from velfield.pipeline import given_files  # a second of imports, for which the first frame need not wait
+
+    for option in pending:
+        try:
+            given_files.READ_GIVEN[option](Path(getattr(plan.job.inputs, option)), plan)
+        except InputError as error:
+            raise InputError(f"--{option}: {error}") from None
     is_far_off = plan.frame_count * plan.info.width * plan.info.height > _LONG_PX  # the stage that checks it too
-    if plan.job.inputs.base and _is_pending(plan, "base") and is_far_off:
-        check_base_area(plan)
-
-
-def _read_detector(path: Path, plan: Plan) -> Detector:
-    """A model of another maker opens a session: on the device of the stages, which report what limits it."""
-    from velfield.detection.runtime import use_device
-
-    use_device(plan.config.work.device)
-    return load_detector(path)
-
-
-def check_base_area(plan: Plan) -> None:
-    """Refuse a base image of another area by one frame of the flight's middle, before the others are decoded.
-
-    The lens is not known yet. So the middle of the frame, where a lens distorts little, is tried as well as all of it,
-    both reduced, and only an image to which neither registers is refused; the base stage decides on the others.
-
-    Raises
-    ------
-    InputError
-        Neither registers: with the scores.
-    """
-    grey = _middle_frame(plan)
-    if grey is None:
-        return
-    base = read_base_raster(Path(plan.job.inputs.base or ""), plan.config.frames).grey
-    height, width = grey.shape
-    middle = grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    with ThreadPoolExecutor(2) as pool:
-        tries = [pool.submit(_register_reduced, plan, image, base) for image in (grey, middle)]
-        found = [one.result() for one in tries]
-    reasons = [one.reason for one in found if isinstance(one, Failure)]
-    if len(reasons) < len(found):
-        return
-    reason = next((reason for reason in reasons if MIRRORED in reason), reasons[-1])
-    raise InputError(f"--base {plan.job.inputs.base}: {reason}")
-
-
-def _register_reduced(plan: Plan, image: GreyImage, base: GreyImage) -> IntersensorResult | Failure:
-    """Register an image that no lens is known of, reduced as far as it shows the area."""
-    factor = min(1.0, _CHECKED_SIDE_PX / max(image.shape))
-    small = rescale(image, factor)
-    return register_intersensor(small, rescale(base, factor), plan.config.base, lens=pinhole(small.shape))
-
-
-def _middle_frame(plan: Plan) -> GreyImage | None:
-    """A usable frame near the middle of the flight; None where the first few there are not."""
-    middle = plan.indices[plan.frame_count // 2 :][:_TRIED_FRAMES]
-    for frame in iter_frames(Path(plan.job.inputs.source), plan.info, middle):
-        if not frame.flags & UNUSABLE:
-            return frame.grey
-    return None
+    if "base" in pending and is_far_off:
+        given_files.check_base_area(plan)
 
 
 def _is_pending(plan: Plan, option: str) -> bool:

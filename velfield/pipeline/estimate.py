@@ -10,9 +10,8 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut, Stage
 from velfield.pipeline.units import group_name, stage_units, unit_name
-from velfield.run.field_writer import FIELD_BLOCK, GROUP_TILES
 from velfield.run.layout import is_remote
-from velfield.sources.geo import read_base_raster
+from velfield.run.stores import FIELD_BLOCK, GROUP_TILES
 
 _BYTES_A_DETECTION_FRAME = 150_000
 _BYTES_A_TILE = 200_000
@@ -97,6 +96,8 @@ def describe_plan(plan: Plan, at_a_time: int = 2) -> str:
     lines = [f"{plan.job.inputs.source}: {plan.info.frame_count} frames of {plan.info.width} x {plan.info.height} px, "]
     lines[0] += f"{plan.frame_count} of them to process, {plan.unit_frames} a unit"
     if plan.job.inputs.base is not None:
+        from velfield.sources.geo import read_base_raster
+
         base = read_base_raster(Path(plan.job.inputs.base), plan.config.frames)
         size = f"{base.grey.shape[1]} x {base.grey.shape[0]} px"
         scale = "of unknown scale" if base.gsd_m is None else f"of {base.gsd_m:.4g} m"

@@ -21,10 +21,9 @@ from velfield.detection.registry import shipped_detector
 from velfield.pipeline.graphs import compute_here, unit_graph
 from velfield.pipeline.plan import Plan, write_flight_record
 from velfield.pipeline.result import without_progress
-from velfield.pipeline.stage import STAGES, Stage, stage_keys, stages_before
-from velfield.pipeline.stages.registration import lost_frames
+from velfield.pipeline.stage import FIELD_STAGES, STAGE, STAGES, Stage, stage_keys, stages_before
 from velfield.pipeline.stages.report import write_report
-from velfield.pipeline.summary import summarise_stage
+from velfield.pipeline.summary import lost_frames, summarise_stage
 from velfield.pipeline.units import prepare_stage, stage_units
 from velfield.run.commits import commit_path, read_commits, valid_commit, write_atomically
 from velfield.run.layout import RunLayout, remove_tree
@@ -32,9 +31,6 @@ from velfield.run.results import link_shared_outputs
 
 FIRST_FRAMES = 16
 """Frames of the first preview: three seconds."""
-_BEFORE = stages_before("tracklets")
-FIELD_STAGES = tuple(stage.name for stage in STAGES if stage.name not in _BEFORE)
-"""Stages that a preview computes from the finished units: tracklets, tracks, field and maps."""
 Compute = Callable[[Any], Any]
 """Gives the value of a Dask graph."""
 Publishing = AbstractContextManager[object]
@@ -67,21 +63,17 @@ def publish_first_preview(plan: Plan, publishing: Publishing) -> None:
 def preview_finished_units(plan: Plan, compute: Compute, publishing: Publishing) -> int:
     """Make and publish the preview of the units whose detections are finished; returns the number of their frames."""
     remove_tree(plan.layout.preview)
-    units = {unit.name: len(unit.frames) for unit in stage_units(plan, _stage("detections"))}
+    units = {unit.name: len(unit.frames) for unit in stage_units(plan, STAGE["detections"])}
     found = {name: valid_commit(plan.layout, "detections", name, plan.keys["detections"]) for name in units}
     finished = [name for name, record in found.items() if record is not None]
     so_far = _with_root(plan).with_lost_units([f"detections {name}" for name in units if name not in finished])
-    link_shared_outputs(plan.layout, so_far.layout, _BEFORE)
-    _make(so_far, [_stage(name) for name in FIELD_STAGES], compute)
+    link_shared_outputs(plan.layout, so_far.layout, stages_before(FIELD_STAGES[0]))
+    _make(so_far, [STAGE[name] for name in FIELD_STAGES], compute)
     frames = sum(units[name] for name in finished)
     _write_page(plan, so_far, f"{frames} of {plan.frame_count} frames")
     with publishing:
         _publish(plan.layout, so_far.layout, with_tracks=True)
     return frames
-
-
-def _stage(name: str) -> Stage:
-    return next(stage for stage in STAGES if stage.name == name)
 
 
 def _with_root(plan: Plan, **inputs: str | None) -> Plan:

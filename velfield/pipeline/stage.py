@@ -168,7 +168,7 @@ STAGES: tuple[Stage, ...] = (
     # Spread frames registered to the sharpest, and their median; or the registration of a given image.
     Stage(
         name="base",
-        version=19,
+        version=20,
         label="base image",
         lines=(
             Line(
@@ -359,6 +359,10 @@ def stages_before(name: str) -> list[str]:
     """
     names = list(STAGE)
     return names[: names.index(name)]
+
+
+FIELD_STAGES = tuple(name for name in STAGE if name not in stages_before("tracklets"))
+"""Stages that a preview computes from the finished units: from tracklets to maps."""
 
 
 def resolve(function: str) -> Callable[..., Any]:

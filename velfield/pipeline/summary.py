@@ -6,7 +6,7 @@ from schemas.records import CommitRecord
 from schemas.summary import RunSummary, StageSummary
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import STAGE
-from velfield.pipeline.stages.registration import lost_frames
+from velfield.run.stores import open_frames, open_registration
 from velfield.sources.frames import FootageLoss
 
 _MEANS = frozenset({"heldout_px", "residual_px", "searched"})
@@ -50,6 +50,17 @@ def summarise_run(plan: Plan, stages: Sequence[StageSummary]) -> RunSummary:
     """The summary of a run of frames: its stages, and the frames that are not there or in no tracklet."""
     absent = tuple(f"{plan.job.inputs.source}: {line}" for line in plan.info.warnings if isinstance(line, FootageLoss))
     return RunSummary(root=plan.job.root, stages=tuple(stages), frames_lost=lost_frames(plan), footage_lost=absent)
+
+
+def lost_frames(plan: Plan) -> tuple[str, ...]:
+    """Frames that are not registered, with the reason, one line each."""
+    times_s = open_frames(plan.layout.frames).column("time_s")
+    statuses = open_registration(plan.layout.registration).statuses()
+    return tuple(
+        f"frame {frame} ({times_s[frame]:.3f} s): {status or 'not processed'}"
+        for frame, status in enumerate(statuses)
+        if status != "ok"
+    )
 
 
 def _keys(line: str) -> list[str]:

@@ -26,7 +26,7 @@ where the chain began.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -106,19 +106,24 @@ _MAX_BASE_KEYPOINT_RATIO = 3
 
 @dataclass(frozen=True, eq=False)
 class BaseReference:
-    """The base image with the features that frames are registered to. Picklable.
+    """The base image with the features that frames are registered to.
 
     Attributes
     ----------
     shape : (height, width) of the base image, px.
-    keypoints : keypoints, base px.
     templates, dense_templates : patches at its corners; a denser set for another sensor's image.
+    detect : detects its keypoints.
     """
 
     shape: tuple[int, int]
-    keypoints: Keypoints
     templates: Templates
     dense_templates: Templates
+    detect: Callable[[], Keypoints]
+
+    @cached_property
+    def keypoints(self) -> Keypoints:
+        """Keypoints, base px: costly, and not needed where optical flow starts all frames."""
+        return self.detect()
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +186,9 @@ def prepare_base(
     """
     frame_area = grey.size if frame_shape is None else frame_shape[0] * frame_shape[1]
     ratio = float(np.clip(grey.size / frame_area, 1.0, _MAX_BASE_KEYPOINT_RATIO))
-    keypoints = detect_keypoints(grey, config, mask, count=round(config.max_keypoints * ratio))
+    detect = partial(detect_keypoints, grey, config, mask, count=round(config.max_keypoints * ratio))
     templates, dense_templates = make_template_sets(grey, mask, counts=(N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR))
-    return BaseReference((grey.shape[0], grey.shape[1]), keypoints, templates, dense_templates)
+    return BaseReference((grey.shape[0], grey.shape[1]), templates, dense_templates, detect)
 
 
 def register_chain(
@@ -192,8 +197,9 @@ def register_chain(
     lens: Lens,
     config: RegistrationConfig,
     first_previous: Keypoints | None = None,
+    known: "KnownFrame | None" = None,
 ) -> list[FrameRegistration]:
-    """Register a chain of frames in time order; results in the order of the frames.
+    """Register a chain of frames in the order of time, or against it; results in the order of the frames.
 
     Parameters
     ----------
@@ -201,19 +207,22 @@ def register_chain(
         (index, grey (h, w) uint8, function that detects its keypoints in raw px) of each.
     first_previous
         Keypoints of the frame before the first, in base px (see `map_keypoints`); None: the chain begins here.
+    known
+        A frame from which optical flow may start the first.
     """
     results: list[FrameRegistration] = []
-    before: _ChainFrame | None = None
+    by_flow = config.start == "optical_flow" and config.model != "polyprojective"
+    before = known.as_before(base) if known is not None and by_flow else None
     first: FrameRegistration | None = None
     history: _PatchHistory | None = None
     for _, grey, detect in frames:
-        by_flow = config.start == "optical_flow" and config.model != "polyprojective"
         small = shrink(grey) if by_flow else grey
         result = None
-        if by_flow and before is not None and first is not None:
+        if by_flow and before is not None:
             history = history or _PatchHistory.begin(base, before.result)
             result = _register_by_flow(grey, small, before, base, lens, config, history.choose(before, grey.shape))
-            result = None if result is None or _is_worse(result, first) else result
+            result = None if result is None or (first is not None and _is_worse(result, first)) else result
+            first = first or result
         if result is None:
             previous = first_previous if before is None else map_keypoints(before.detect(), before.transform)
             result = register_frame(grey, detect(), base, lens, config, previous)
@@ -224,6 +233,24 @@ def register_chain(
             if history is not None:
                 history.note(result)
     return results
+
+
+@dataclass(frozen=True, eq=False)
+class KnownFrame:
+    """A frame (h, w) uint8 whose map to the base image is known, to a few pixels, without registration."""
+
+    grey: GreyImage
+    transform: FrameTransform
+    detect: Callable[[], Keypoints]
+
+    def as_before(self, base: BaseReference) -> "_ChainFrame":
+        """As if it had been registered, by all patches of the base image that it shows."""
+        xy_base = base.templates.xy.astype(np.float64)
+        xy_raw = self.transform.to_raw(xy_base)
+        shown = ((xy_raw >= 0) & (xy_raw <= np.array(self.grey.shape[::-1]) - 1)).all(axis=1)
+        points = ControlPoints(xy_raw[shown], xy_base[shown], np.full(int(shown.sum()), _FLOW_SIGMA_PX))
+        result = FrameRegistration(self.transform, "ok", control_points=points)
+        return _ChainFrame(result, self.transform, shrink(self.grey), self.detect)
 
 
 @dataclass(frozen=True, eq=False)

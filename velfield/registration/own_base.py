@@ -1,10 +1,10 @@
 """The flight's own base image: a median mosaic of its frames, free of traffic.
 
 First of two passes: frames sampled over the flight are registered to the sharpest one (the reference), and their median
-on its undistorted grid is the base image. Each starts from the one before, by optical flow, as in any registration:
-keypoints are detected where that fails. Frames that do not overlap the reference are added in further rounds, in which
-all are registered to the median of the round before. The second pass is the usual registration of all frames of the
-flight to this base image.
+on its undistorted grid is the base image. In short chains, forward and backward in time, each starts from its
+neighbour, and the first from the reference, by optical flow, as in any registration: keypoints are detected where that
+fails. Frames that do not overlap the reference are added in further rounds, in which all are registered to the median
+of the round before. The second pass is the usual registration of all frames of the flight to this base image.
 
 The rolling shutter of the reference frame distorts the grid, and all frames would be registered to that distortion. Its
 row motion is estimated as the mean displacement of all frames' control points relative to their smooth maps, as a
@@ -23,9 +23,10 @@ from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
+from velfield.parallel import parallel_map, usable_processors
 from velfield.registration import kernels
 from velfield.registration.background import NOT_COVERED, median_of_stack
-from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_chain
+from velfield.registration.intrasensor import BaseReference, FrameRegistration, KnownFrame, prepare_base, register_chain
 from velfield.registration.joint import ControlPoints
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, fit_normalisation
@@ -37,8 +38,7 @@ DetectKeypoints = Callable[[int], Keypoints]
 _MIN_FRAMES = 3
 _MAX_ROUNDS = 4
 """Rounds after the first add frames that did not overlap the base image before."""
-_CHAIN_FRAMES = 16
-"""Frames of a chain, each started from the one before, the first by its keypoints."""
+_CHAIN_FRAMES = 8
 _MAX_EXTENT = 2.0
 """The base image extends at most this many frame sizes beyond the reference on each side."""
 _STACK_BYTES = 400_000_000
@@ -122,7 +122,6 @@ def build_own_base(
     reference: int,
     lens: Lens,
     config: RegistrationConfig,
-    threads: int = 1,
 ) -> OwnBase | Failure:
     """Build the flight's own base image on the undistorted grid of a reference frame.
 
@@ -136,8 +135,6 @@ def build_own_base(
         The frames to use, in time order, including the reference.
     reference
         The frame that defines the grid: the sharpest.
-    threads
-        Chains registered, and frames rectified, concurrently; the result does not depend on it.
 
     Returns
     -------
@@ -149,14 +146,15 @@ def build_own_base(
     motion_px, count = np.zeros((height, 2)), 0
     for _ in range(_MAX_ROUNDS):
         reference_image = prepare_base(base, config, mask=mask, frame_shape=grey.shape)
-        registered = _register_frames(read, detect, frames, reference_image, lens, config, threads)
+        known = KnownFrame(grey, grid.transform, partial(detect, reference))
+        registered = _register_chains(read, detect, _chains(frames, reference), reference_image, known, config)
         if len(registered) < _MIN_FRAMES:
             return Failure(
                 f"{len(registered)} of {len(frames)} frames overlap with frame {reference}, {_MIN_FRAMES} needed"
             )
         motion = _estimate_row_motion(registered, grid)
         motion_px += _evaluate_spline(motion, np.arange(height, dtype=np.float64), height)
-        offset, base, mask = _build_mosaic(read, registered, grid, motion, threads)
+        offset, base, mask = _build_mosaic(read, registered, grid, motion)
         grid = replace(grid, origin=(grid.origin[0] + offset[0], grid.origin[1] + offset[1]))
         if len(registered) in (len(frames), count):
             break
@@ -173,27 +171,30 @@ def _undistort_reference(grey: GreyImage, lens: Lens) -> tuple[_Grid, GreyImage,
     return grid, *warp_to_base(grey, grid.transform, window=window, interpolation=cv2.INTER_CUBIC)
 
 
-def _register_frames(
+def _chains(frames: Sequence[int], reference: int) -> list[list[int]]:
+    """The frames in short chains that lead away from the reference; that is one by itself: no other fits as well."""
+    sides = [one for one in frames if one > reference], [one for one in frames[::-1] if one < reference]
+    return [[reference], *(side[k : k + _CHAIN_FRAMES] for side in sides for k in range(0, len(side), _CHAIN_FRAMES))]
+
+
+def _register_chains(
     read: ReadFrame,
     detect: DetectKeypoints,
-    frames: Sequence[int],
+    chains: Sequence[Sequence[int]],
     base: BaseReference,
-    lens: Lens,
+    known: KnownFrame,
     config: RegistrationConfig,
-    threads: int,
 ) -> dict[int, tuple[FrameTransform, ControlPoints]]:
-    """Register frames to the base image, in chains: maps and control points of those that succeed."""
-    chains = np.array_split(np.asarray(frames), -(-len(frames) // _CHAIN_FRAMES))
+    """Register chains of frames to the base image: maps and control points of those that succeed."""
 
-    def register(chain: IntArray) -> list[FrameRegistration]:
-        shown = ((int(frame), read(int(frame)), partial(detect, int(frame))) for frame in chain)
-        return register_chain(shown, base, lens, config)
+    def register(chain: Sequence[int]) -> list[FrameRegistration]:
+        shown = ((frame, read(frame), partial(detect, frame)) for frame in chain)
+        return register_chain(shown, base, known.transform.lens, config, known=known)
 
-    with ThreadPoolExecutor(max_workers=threads) as pool:
-        results = [result for chain in pool.map(register, chains) for result in chain]
     return {
         frame: (result.transform, result.control_points)
-        for frame, result in zip(frames, results, strict=True)
+        for chain, results in zip(chains, parallel_map(register, chains), strict=True)
+        for frame, result in zip(chain, results, strict=True)
         if result.transform is not None and result.control_points is not None
     }
 
@@ -239,7 +240,6 @@ def _build_mosaic(
     registered: Mapping[int, tuple[FrameTransform, ControlPoints]],
     grid: _Grid,
     motion: FloatArray,
-    threads: int,
 ) -> tuple[tuple[int, int], GreyImage, Mask]:
     """Offset from the grid's origin, median of the frames, and mask of the pixels that enough frames cover."""
     width, height = grid.width, grid.height
@@ -252,7 +252,7 @@ def _build_mosaic(
     )
     band = max(64, _STACK_BYTES // (len(maps) * (x1 - x0 + 1)))
     windows: list[Window] = [(x0, top, x1 - x0 + 1, min(band, y1 + 1 - top)) for top in range(y0, y1 + 1, band)]
-    with ThreadPoolExecutor(max_workers=threads) as pool:
+    with ThreadPoolExecutor(usable_processors()) as pool:
         parts = [_median_in(read, maps, window, pool) for window in windows]
     covered = np.concatenate([count for _, count in parts]) >= min(_MIN_FRAMES, len(maps))
     return (x0, y0), np.concatenate([median for median, _ in parts]), covered

@@ -56,14 +56,20 @@ def match_frame_pairs(frames: Sequence[GreyImage], lens: Lens) -> FramePairs | N
         inliers, sensitivity_px = _find_inliers(undistorted[i][matches[:, 0]], undistorted[j][matches[:, 1]], shape)
         return matches[inliers], sensitivity_px
 
-    screened = [(match(i, j, _N_SCREENING_KEYPOINTS)[1], i, j) for i, j in combinations(range(len(frames)), 2)]
-    pairs = []
-    for _, i, j in select_informative_pairs([pair for pair in screened if pair[0] > 0], len(frames)):
+    def align(pair: tuple[float, int, int]) -> tuple[int, int, FloatArray, FloatArray] | None:
+        _, i, j = pair
         matches = match(i, j, _N_KEYPOINTS)[0]
-        if len(matches) >= _MIN_MATCHES:
-            matches = matches[np.argsort(matches[:, 0])][:_MAX_MATCHES]
-            pairs.append((i, j, keypoints[i].xy[matches[:, 0]], keypoints[j].xy[matches[:, 1]]))
-    aligned = parallel_map(lambda pair: (*pair[:2], *align_matches(frames[pair[0]], frames[pair[1]], *pair[2:])), pairs)
+        if len(matches) < _MIN_MATCHES:
+            return None
+        ends = matches[np.argsort(matches[:, 0])][:_MAX_MATCHES].T
+        return i, j, *align_matches(frames[i], frames[j], keypoints[i].xy[ends[0]], keypoints[j].xy[ends[1]])
+
+    both = list(combinations(range(len(frames)), 2))
+    sensitivity_px = parallel_map(lambda pair: match(*pair, _N_SCREENING_KEYPOINTS)[1], both)
+    screened = [(found, *pair) for found, pair in zip(sensitivity_px, both, strict=True) if found > 0]
+    aligned = [
+        pair for pair in parallel_map(align, select_informative_pairs(screened, len(frames))) if pair is not None
+    ]
     return _pad(aligned, shape) if aligned else None
 
 

@@ -18,7 +18,7 @@ from schemas.records import GridRecord
 from velfield.field.accumulate import UNIT, VARIANCE_UNIT, FieldTile, Weight
 from velfield.field.segments import VelocityBins, band_radius_px, stationary_speed_px_per_s
 from velfield.field.statistics import tile_statistics
-from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, create_field
+from velfield.run.stores import GROUP_TILES, HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, create_field
 
 _SPEED = {"units": "px s-1"}
 
@@ -80,11 +80,6 @@ def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dic
     }
     return {name: np.asarray(value, LAYERS[name].get("dtype", "float32")) for name, value in values.items()}
 
-
-GROUP_TILES = 8
-"""Side of a group in tiles, 512 px: a chunk of the layers."""
-FIELD_BLOCK = 2
-"""Side of a unit of work in groups: each reads the tables of tracks once, and costs a task of its own."""
 
 Group = tuple[int, int]
 """(row, column)."""

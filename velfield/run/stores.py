@@ -34,6 +34,10 @@ HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
 """Histogram of every field, with its attributes."""
+GROUP_TILES = 8
+"""Side of a group in tiles, 512 px: a chunk of the layers."""
+FIELD_BLOCK = 2
+"""Side of a unit of work in groups: each reads the tables of tracks once, and costs a task of its own."""
 
 
 def _create(

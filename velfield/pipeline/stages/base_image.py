@@ -18,7 +18,7 @@ from velfield.camera.lens import Lens, pinhole
 from velfield.camera.map_fit import fit_lens_to_map
 from velfield.errors import Failure, InputError
 from velfield.exports.cog import write_cog
-from velfield.parallel import parallel_map, usable_processors
+from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
@@ -141,7 +141,6 @@ def _build_own_base(
             reference=reference,
             lens=lens,
             config=plan.config.registration,
-            threads=usable_processors(),
         )
         tried.append((own, reference))
         if not isinstance(own, Failure) and own.frames > _OVERLAPPING * len(frames):

@@ -24,10 +24,10 @@ from velfield.field.segments import (
 from velfield.field.time_intervals import TimeInterval, assign_intervals
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.run.field_writer import FIELD_BLOCK, Group, GroupWriter, create_field_store, tile_groups
+from velfield.run.field_writer import Group, GroupWriter, create_field_store, tile_groups
 from velfield.run.frame_transforms import read_grid
 from velfield.run.layout import remove_tree
-from velfield.run.stores import open_field, store_key
+from velfield.run.stores import FIELD_BLOCK, open_field, store_key
 from velfield.run.tables import read_tables
 
 _PLACE_COLUMNS = ["track_id", *(f"{axis}_{k}_px" for k in range(3) for axis in "xy")]

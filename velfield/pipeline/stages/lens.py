@@ -8,7 +8,6 @@ from velfield.camera.fusion import refine_lens
 from velfield.camera.lens import lens_from_record, pinhole
 from velfield.camera.plumbline import calibrate
 from velfield.camera.tilt import tilt_of_frames
-from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.pairing import match_frame_pairs
@@ -44,7 +43,7 @@ def calibrate_flight(plan: Plan) -> StageResult:
     else:
         frames = select_usable_frames(plan, config.frames)
         images = [store.read(frame) for frame in frames]
-        record = calibrate(images, config, apply=parallel_map).to_record()
+        record = calibrate(images, config).to_record()
         if config.refine == "auto":
             record = refine_lens(record, match_frame_pairs(images, lens_from_record(record.lens)))
         record = record.model_copy(update={"tilt": _tilt(images[:_TILT_FRAMES], record)})
@@ -57,7 +56,7 @@ def calibrate_flight(plan: Plan) -> StageResult:
 
 
 def _tilt(images: list[GreyImage], record: CameraRecord) -> TiltEvidence | None:
-    found = tilt_of_frames(images, lens_from_record(record.lens), apply=parallel_map) if images else None
+    found = tilt_of_frames(images, lens_from_record(record.lens)) if images else None
     if found is None:
         return None
     x, y = found.convergence

@@ -187,17 +187,6 @@ def usable_frames(plan: Plan) -> Mask:
     return np.asarray(registered & ((flags & int(UNUSABLE)) == 0), np.bool_)
 
 
-def lost_frames(plan: Plan) -> tuple[str, ...]:
-    """Frames that are not registered, with the reason, one line each."""
-    times_s = open_frames(plan.layout.frames).column("time_s")
-    statuses = open_registration(plan.layout.registration).statuses()
-    return tuple(
-        f"frame {frame} ({times_s[frame]:.3f} s): {status or 'not processed'}"
-        for frame, status in enumerate(statuses)
-        if status != "ok"
-    )
-
-
 def detect_frame_keypoints(plan: Plan, frame: int) -> Keypoints:
     """Detect the keypoints of a frame, raw px, outside the vehicles of the given boxes."""
     return _detect_keypoints(plan, frame, open_frames(plan.layout.frames).read(frame))
@@ -257,7 +246,8 @@ def _read_reference(plan: Plan) -> BaseReference:
         for name, kind in _FEATURES.items()
     }
     height, width = arrays["shape"].tolist()
-    return BaseReference((height, width), **features)
+    keypoints = features.pop("keypoints")
+    return BaseReference((height, width), **features, detect=lambda: keypoints)
 
 
 def read_given_base(plan: Plan) -> BaseRaster | None:
