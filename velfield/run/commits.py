@@ -106,15 +106,18 @@ def content_key(
     return digest_bytes(text.encode())
 
 
-def write_atomically(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes, *, sync: bool = True) -> None:
     """Write ``data`` so that ``path`` is either unchanged or complete."""
-    with open_atomically(path) as file:
+    with open_atomically(path, sync=sync) as file:
         file.write(data)
 
 
 @contextmanager
-def open_atomically(path: Path) -> Iterator[BinaryIO]:
-    """A file to write, which takes the place of ``path`` once it is complete."""
+def open_atomically(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
+    """A file to write, which takes the place of ``path`` once it is complete.
+
+    ``sync``: and on the disk; what is one of many outputs of a unit need not be before `commit`, which sees to it.
+    """
     if is_remote(path):
         buffer = io.BytesIO()
         yield buffer
@@ -124,8 +127,9 @@ def open_atomically(path: Path) -> Iterator[BinaryIO]:
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     with partial.open("wb") as file:
         yield file
-        file.flush()
-        os.fsync(file.fileno())
+        if sync:
+            file.flush()
+            os.fsync(file.fileno())
     partial.replace(path)
 
 

@@ -173,8 +173,9 @@ class GroupWriter:
         while self._writes:
             self._writes.popleft().result()
         self._zeros.clear()
-        for name, values in self.layers.items():
-            self.store.write_layer(name, self.y0, self.x0, values)
+        layers = [_writers.submit(self.store.write_layer, name, self.group, one) for name, one in self.layers.items()]
+        for layer in layers:
+            layer.result()
 
     def files(self) -> list[Path]:
         """The files written, once closed, and the store's metadata."""

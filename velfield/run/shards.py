@@ -1,10 +1,13 @@
-"""A tile of the histogram as a shard of Zarr's codec ``sharding_indexed``: blocks of pixels, each compressed by itself.
+"""Chunks of a field's arrays as zarr encodes them, without its machinery, which takes milliseconds a chunk.
+
+A tile of the histogram is a shard of the codec ``sharding_indexed``: blocks of pixels, each compressed by itself.
 
 Vehicles passed a tenth of the pixels of a tile of 22 MB. zarr's own codec looks at all of it and takes a third of a
 millisecond a block; here only the blocks that vehicles passed are looked at.
 """
 
 from math import gcd, prod
+from typing import Any
 
 import google_crc32c
 import numpy as np
@@ -46,6 +49,19 @@ def encode_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], tile: in
         end += len(parts[-1])
     index_bytes = index.tobytes()
     return b"".join([*parts, index_bytes, _checksum(index_bytes)])
+
+
+def encode_chunk(values: NDArray[Any], shape: tuple[int, ...], fill: Any) -> bytes | None:
+    """A chunk of (y, x) values, filled up to its shape; None where all of it has the value that is not stored.
+
+    As zarr encodes it, in a tenth of the time that its machinery takes for the many small layers of a group.
+    """
+    empty = np.isnan(values) if np.isnan(fill) else values == fill
+    if empty.all():
+        return None
+    whole = np.full(shape, fill, values.dtype.newbyteorder("<"))
+    whole[: values.shape[0], : values.shape[1]] = values
+    return bytes(_CODEC.encode(whole))
 
 
 def decode_tile(shard: bytes, shape: tuple[int, ...], tile: int) -> NDArray[np.int32]:

@@ -24,7 +24,7 @@ from schemas.records import FORMAT_VERSION
 from velfield.errors import InputError, StoreError
 from velfield.run.commits import write_atomically
 from velfield.run.layout import is_remote
-from velfield.run.shards import block_side, decode_tile, encode_tile
+from velfield.run.shards import block_side, decode_tile, encode_chunk, encode_tile
 
 _ZSTANDARD = ZstdCodec(level=1, checksum=True)
 _STATUS_BYTES = 160
@@ -481,7 +481,7 @@ class FieldStore:
         self, row: int, column: int, histogram: NDArray[np.int32], count: NDArray[np.int32], name: str = HISTOGRAM
     ) -> None:
         """Write one tile of a histogram, (ty, tx, nvy, nvx), zero where ``count`` (ty, tx) is: one file."""
-        write_atomically(self._tile_path(row, column, name), encode_tile(histogram, count, self.tile))
+        write_atomically(self._tile_path(row, column, name), encode_tile(histogram, count, self.tile), sync=False)
 
     def _tile_path(self, row: int, column: int, name: str) -> Path:
         return self.path / name / "c" / str(row) / str(column) / "0" / "0"
@@ -506,9 +506,17 @@ class FieldStore:
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
 
-    def write_layer(self, name: str, y: int, x: int, values: NDArray[Any]) -> None:
-        """Write a window of a layer, of whole chunks."""
-        self.group[name][y : y + values.shape[0], x : x + values.shape[1]] = values
+    def write_layer(self, name: str, group: tuple[int, int], values: NDArray[Any]) -> None:
+        """Write a layer of one group, (y, x), smaller than the others at the map's edge: one file, none if empty."""
+        path, array = self._layer_path(name, group), self.group[name]
+        chunk = encode_chunk(values, array.chunks, array.fill_value)
+        if chunk is None:
+            path.unlink(missing_ok=True)
+        else:
+            write_atomically(path, chunk, sync=False)
+
+    def _layer_path(self, name: str, group: tuple[int, int]) -> Path:
+        return self.path / name / "c" / str(group[0]) / str(group[1])
 
     def layer(self, name: str) -> NDArray[Any]:
         """A whole layer, (y, x)."""
@@ -518,7 +526,7 @@ class FieldStore:
         """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
         places = list(tiles)
         histogram = [self._tile_path(*place, name) for name in self.histogram_names() for place in places]
-        layers = [self.path / name / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
+        layers = [self._layer_path(name, group) for name in self.layer_names()]
         axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
         return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
 
