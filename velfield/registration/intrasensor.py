@@ -100,6 +100,8 @@ _FLOW_ENDS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.03)
 """A point is followed for so many iterations, or until it moves by less than so many px of the scaled frame."""
 _MAX_COVERAGE_LOSS, _MAX_RESIDUAL_RATIO = 0.05, 1.5
 """Against the first frame of the chain: a frame that is worse is registered again by its keypoints."""
+_MIN_FIRST_COVERAGE = 0.5
+"""Of a first frame that optical flow started from a known one: of a chance agreement the inliers are in few cells."""
 _MAX_BASE_KEYPOINT_RATIO = 3
 """Keypoints of the base image over those of a frame, at most; in proportion to its area."""
 
@@ -221,7 +223,7 @@ def register_chain(
         if by_flow and before is not None:
             history = history or _PatchHistory.begin(base, before.result)
             result = _register_by_flow(grey, small, before, base, lens, config, history.choose(before, grey.shape))
-            result = None if result is None or (first is not None and _is_worse(result, first)) else result
+            result = None if result is None or _is_worse(result, first) else result
             first = first or result
         if result is None:
             previous = first_previous if before is None else map_keypoints(before.detect(), before.transform)
@@ -312,7 +314,10 @@ def _are_inliers(templates: Templates, result: FrameRegistration) -> Mask:
     return np.isin(numbers, found)
 
 
-def _is_worse(result: FrameRegistration, first: FrameRegistration) -> bool:
+def _is_worse(result: FrameRegistration, first: FrameRegistration | None) -> bool:
+    """Whether a frame may have gone astray from the first of its chain; from a known frame, where it is the first."""
+    if first is None:
+        return result.coverage < _MIN_FIRST_COVERAGE
     return (
         result.coverage < first.coverage - _MAX_COVERAGE_LOSS
         or not result.heldout_px <= _MAX_RESIDUAL_RATIO * first.heldout_px

@@ -39,6 +39,7 @@ _MIN_FRAMES = 3
 _MAX_ROUNDS = 4
 """Rounds after the first add frames that did not overlap the base image before."""
 _CHAIN_FRAMES = 8
+"""Chains are registered side by side."""
 _MAX_EXTENT = 2.0
 """The base image extends at most this many frame sizes beyond the reference on each side."""
 _STACK_BYTES = 400_000_000
