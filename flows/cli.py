@@ -1,5 +1,6 @@
 """The ``velfield`` command. Imports nothing heavy until a command runs."""
 
+import atexit
 import gc
 import os
 import sys
@@ -108,6 +109,7 @@ def main() -> None:
     """Run the command; bad input is one clear line, never a traceback."""
     limit_threads()
     as_ctrl_c()
+    atexit.register(gc.freeze)  # what is left goes with the process: to look through it takes a second
     _warn_of_settings_in_one_line()
     try:
         if not {"--help", "-h", "--version"} & set(sys.argv):
@@ -144,7 +146,6 @@ def main() -> None:
             raise
         print(f"velfield: S3: {_explain_s3(error)}", file=sys.stderr)
         status = BAD_INPUT
-    gc.freeze()  # what is left goes with the process: to look through it takes a second
     sys.exit(status)
 
 

@@ -1,4 +1,4 @@
-"""Threads for the work of one unit on several images, where no graph runs it in parallel already.
+"""Threads for the work of one unit on several images or models, where no graph runs it in parallel already.
 
 The steps of long work that nothing else counts: those of a training, whatever the method, for a progress bar.
 """
@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from threading import Lock
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -21,6 +22,19 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T], *, at_most: int
     """
     with ThreadPoolExecutor(min(usable_processors(), at_most or usable_processors())) as pool:
         return list(pool.map(function, items))
+
+
+def once(function: Callable[[], R]) -> Callable[[], R]:
+    """A function that gives what ``function`` gave when it was called first, and calls it in one thread only."""
+    lock, found = Lock(), list[R]()
+
+    def call() -> R:
+        with lock:
+            if not found:
+                found.append(function())
+            return found[0]
+
+    return call
 
 
 _step_listeners: list[Callable[[int, int], None]] = []

@@ -10,7 +10,7 @@ import pytest
 
 from schemas.flight import RegistrationConfig
 from schemas.simulation import CameraSimulation, OtherSensorSimulation
-from velfield.camera.lens import HarrisLens
+from velfield.camera.lens import HarrisLens, pinhole
 from velfield.errors import Failure
 from velfield.registration import intrasensor
 from velfield.registration.alignment import Templates, align_patches, make_templates, smooth_fine
@@ -278,6 +278,17 @@ def test_own_base_image_serves_as_well_as_a_given_one() -> None:
     score = score_registration(truth, to_base, range(6), to_truth=fit_homography(truth, to_base, range(6)))
     assert score.mean_px < 1.0
     assert score.jitter_px < 0.1
+
+
+def test_own_base_of_frames_without_any_corner_is_a_failure_with_counts() -> None:
+    """Fog."""
+    rng = np.random.default_rng(1)
+    fog = [cv2.GaussianBlur(rng.normal(128, 90, (240, 320)), (0, 0), 12).round().astype(np.uint8) for _ in range(4)]
+    detected = {k: detect_keypoints(grey, CONFIG) for k, grey in enumerate(fog)}
+    lens = pinhole(fog[0].shape)
+    found = build_own_base(fog.__getitem__, detected.__getitem__, range(4), reference=1, lens=lens, config=CONFIG)
+    assert not found
+    assert "0 of 4 frames overlap with frame 1" in found.reason
 
 
 def test_own_base_of_strange_frames_is_a_failure_with_counts() -> None:

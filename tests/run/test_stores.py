@@ -125,6 +125,40 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
         assert int(field["count"].sum()) == 0
 
 
+@pytest.mark.parametrize("group", [(0, 0), (1, 1)], ids=["whole", "at the map's edge"])
+def test_layers_are_read_by_zarr_as_written(tmp_path: Path, group: tuple[int, int]) -> None:
+    path = tmp_path / "field.zarr"
+    layers = {"count": {"dtype": "int32", "units": "1"}, "modal_vx": {"units": "px s-1"}}
+    create_field(
+        path,
+        key="k",
+        height=20,
+        width=30,
+        tile=8,
+        group_tiles=2,
+        velocities_px_per_s=np.arange(3.0),
+        attributes={},
+        layers=layers,
+    )
+    store, window = (
+        open_field(path, "r+"),
+        np.s_[16 * group[0] : 16 * group[0] + 16, 16 * group[1] : 16 * group[1] + 16],
+    )
+    for name, fill in (("count", 0), ("modal_vx", np.nan)):
+        written = zarr.open_array(path / name, mode="r")
+        values = np.full(written[window].shape, fill, written.dtype)
+        file = path / name / "c" / str(group[0]) / str(group[1])
+        store.write_layer(name, group, values)
+        assert not file.exists()  # nothing to keep
+        values[1, 2:] = -7
+        store.write_layer(name, group, values)
+        expected = np.full(written.shape, fill, written.dtype)
+        expected[window] = values
+        np.testing.assert_array_equal(written[:], expected)
+        store.write_layer(name, group, np.full_like(values, fill))
+        assert not file.exists()
+
+
 def create_empty_field(path: Path, *, side: int, tile: int, bins: int) -> None:
     """A field of a square map without layers."""
     create_field(

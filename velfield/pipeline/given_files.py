@@ -1,4 +1,4 @@
-"""The files that were given beside the frames: whether they can be read, and a base image shows the area."""
+"""The files that were given beside the frames: whether they can be read, and whether a base image shows the area."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -38,7 +38,7 @@ Publishing = AbstractContextManager[object]
 
 
 def make_first_preview(plan: Plan) -> int:
-    """Make the preview of a flight's first frames, by one thread; returns their number.
+    """Make the preview of a flight's first frames, on one worker; returns their number.
 
     One piece of work on one worker: stage by stage it would wait for a free one as often, and for seconds each time.
 

@@ -13,11 +13,12 @@ way below loses, goes through these steps:
 5. the displacement mesh, if cross-validation supports one; its cells are 120 px by default, the paper's 200
    (``cell_size_px``).
 
-Every other frame starts from the one before (``start="optical_flow"``): the inliers of that frame are tracked into this
-one by pyramidal Lucas-Kanade, a fit to them takes the place of steps 1 to 3, and steps 4 and 5 follow. Nothing of the
-earlier frame's error remains: only patches that are aligned to the base image itself are fitted and counted.
+Every other frame, and the first where it follows a known one, starts from the one before (``start="optical_flow"``):
+the inliers of that frame are tracked into this one by pyramidal Lucas-Kanade, a fit to them takes the place of steps 1
+to 3, and steps 4 and 5 follow. Nothing of the earlier frame's error remains: only patches that are aligned to the base
+image itself are fitted and counted.
 Keypoints cost more than all else of a frame's registration. A frame that comes out worse than the one that its chain
-began with is registered again by its keypoints.
+began with, or as the first in fewer than half of its cells, is registered again by its keypoints.
 
 Matches to the previous frame propagate its errors and would let the chain drift: they are used only in those cells of
 the frame where the base image gives no match. Where the base image covers the frame, the result does not depend on
@@ -35,6 +36,7 @@ from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntAr
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
+from velfield.parallel import once
 from velfield.registration.alignment import (
     HALF_PATCH,
     N_PATCHES_CROSS_SENSOR,
@@ -114,7 +116,7 @@ class BaseReference:
     ----------
     shape : (height, width) of the base image, px.
     templates, dense_templates : patches at its corners; a denser set for another sensor's image.
-    detect : detects its keypoints.
+    detect : gives its keypoints, detected when they are first asked for.
     """
 
     shape: tuple[int, int]
@@ -122,7 +124,7 @@ class BaseReference:
     dense_templates: Templates
     detect: Callable[[], Keypoints]
 
-    @cached_property
+    @property
     def keypoints(self) -> Keypoints:
         """Keypoints, base px: costly, and not needed where optical flow starts all frames."""
         return self.detect()
@@ -173,7 +175,7 @@ def prepare_base(
     mask: Mask | None = None,
     frame_shape: tuple[int, int] | None = None,
 ) -> BaseReference:
-    """Detect keypoints and patches of a base image.
+    """Find the patches of a base image; its keypoints are detected when they are first asked for.
 
     Parameters
     ----------
@@ -188,7 +190,7 @@ def prepare_base(
     """
     frame_area = grey.size if frame_shape is None else frame_shape[0] * frame_shape[1]
     ratio = float(np.clip(grey.size / frame_area, 1.0, _MAX_BASE_KEYPOINT_RATIO))
-    detect = partial(detect_keypoints, grey, config, mask, count=round(config.max_keypoints * ratio))
+    detect = once(partial(detect_keypoints, grey, config, mask, count=round(config.max_keypoints * ratio)))
     templates, dense_templates = make_template_sets(grey, mask, counts=(N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR))
     return BaseReference((grey.shape[0], grey.shape[1]), templates, dense_templates, detect)
 
@@ -221,12 +223,16 @@ def register_chain(
         small = shrink(grey) if by_flow else grey
         result = None
         if by_flow and before is not None:
-            history = history or _PatchHistory.begin(base, before.result)
-            result = _register_by_flow(grey, small, before, base, lens, config, history.choose(before, grey.shape))
+            if first is not None:
+                history = history or _PatchHistory.begin(base, before.result)
+            chosen = base.templates if history is None else history.choose(before, grey.shape)
+            result = _register_by_flow(grey, small, before, base, lens, config, chosen)
             result = None if result is None or _is_worse(result, first) else result
             first = first or result
         if result is None:
-            previous = first_previous if before is None else map_keypoints(before.detect(), before.transform)
+            previous = (
+                first_previous if before is None or first is None else map_keypoints(before.detect(), before.transform)
+            )
             result = register_frame(grey, detect(), base, lens, config, previous)
             first = result if result.ok else first
         results.append(result)
@@ -342,7 +348,8 @@ def _register_by_flow(
 ) -> FrameRegistration | None:
     """Register a frame from the inliers of the frame before, by these patches; None where it fails."""
     inliers = before.result.control_points
-    assert inliers is not None, "a registered frame has control points"
+    if not inliers:
+        return None
     chosen = np.linspace(0, len(inliers) - 1, min(_FLOW_POINTS, len(inliers))).astype(np.int64)
     start = ((inliers.xy_raw[chosen] + 0.5) * _FLOW_SCALE - 0.5).astype(np.float32)
     window = (_FLOW_WINDOW_PX, _FLOW_WINDOW_PX)

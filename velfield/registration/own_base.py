@@ -39,7 +39,7 @@ _MIN_FRAMES = 3
 _MAX_ROUNDS = 4
 """Rounds after the first add frames that did not overlap the base image before."""
 _CHAIN_FRAMES = 8
-"""Chains are registered side by side."""
+"""Frames of a chain at most; chains are registered side by side."""
 _MAX_EXTENT = 2.0
 """The base image extends at most this many frame sizes beyond the reference on each side."""
 _STACK_BYTES = 400_000_000
@@ -173,7 +173,10 @@ def _undistort_reference(grey: GreyImage, lens: Lens) -> tuple[_Grid, GreyImage,
 
 
 def _chains(frames: Sequence[int], reference: int) -> list[list[int]]:
-    """The frames in short chains that lead away from the reference; that is one by itself: no other fits as well."""
+    """The frames in short chains that lead away from the reference.
+
+    The reference is a chain of its own: beside it, who fits best of all, every other frame would look gone astray.
+    """
     sides = [one for one in frames if one > reference], [one for one in frames[::-1] if one < reference]
     return [[reference], *(side[k : k + _CHAIN_FRAMES] for side in sides for k in range(0, len(side), _CHAIN_FRAMES))]
 

@@ -116,7 +116,7 @@ def write_atomically(path: Path, data: bytes, *, sync: bool = True) -> None:
 def open_atomically(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
     """A file to write, which takes the place of ``path`` once it is complete.
 
-    ``sync``: and on the disk; what is one of many outputs of a unit need not be before `commit`, which sees to it.
+    ``sync``: and on the disk; of one of many outputs `digest_outputs` sees to it.
     """
     if is_remote(path):
         buffer = io.BytesIO()

@@ -9,7 +9,7 @@ from velfield.field.accumulate import FieldTile
 from velfield.field.algebra import merge_tiles, subtract_tile
 from velfield.field.segments import VelocityBins
 from velfield.field.view import TileSource
-from velfield.run.commits import content_key, digest_file, write_atomically
+from velfield.run.commits import content_key, digest_file, digest_outputs, write_atomically
 from velfield.run.field_reader import tile_reader
 from velfield.run.field_writer import GroupWriter, create_field_store, tile_groups
 from velfield.run.flight_record import read_flight_record
@@ -143,14 +143,17 @@ def _write(
     target = open_field(layout.field, "r+")
     kinds = [[tile_reader(store, name) for store in stores] for name in target.histogram_names()]
     bins = VelocityBins.from_config(config, grid.gsd_m)
+    files = set[Path]()
     for group in tile_groups(grid, config):
-        _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins), kinds, combine)
+        files |= _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins), kinds, combine)
+    digest_outputs(layout, files)  # which sees to it that they are on the disk
     write_atomically(layout.flight, record.model_dump_json(indent=1).encode())  # last: without it nothing is whole
 
 
-def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileSource]], combine: Combine) -> None:
+def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileSource]], combine: Combine) -> set[Path]:
     for row, column in writer.tiles():
         tile, *timed = (combine([read(row, column) for read in readers]) for readers in kinds)
         if tile is not None:
             writer.put(row, column, tile, timed[0] if timed else None)
     writer.close()
+    return set(writer.files())
