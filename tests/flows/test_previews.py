@@ -111,7 +111,7 @@ def test_a_preview_that_fails_fails_alone(
     def broken(*_arguments: Any) -> int:
         raise OSError("no space left")
 
-    monkeypatch.setattr("flows.previews.make_first_preview", broken)
+    monkeypatch.setattr("velfield.pipeline.preview.make_first_preview", broken)
     root = tmp_path / "run"
     shutil.copytree(whole[0], root)
     (root / "index.html").unlink()
