@@ -23,7 +23,7 @@ from velfield.detection.cnn.graph import network_to_onnx
 from velfield.detection.cnn.inference import Predictor, predict_crops, predict_heatmap
 from velfield.detection.registry import shipped_detector
 from velfield.errors import DeviceWarning, InputError
-from velfield.pipeline import check_inputs
+from velfield.pipeline import given_files
 
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 NO_DRIVER = (
@@ -166,6 +166,7 @@ def test_on_a_gpu_all_runs_in_floating_point_on_images_of_one_size(
         ({"fails": "[ONNXRuntimeError] : 9 : NOT_IMPLEMENTED : cuDNN is not available.\n"}, "cuDNN is not available"),
     ],
 )
+@pytest.mark.usefixtures("exact")
 def test_cuda_that_does_not_start_is_told_once_and_the_processor_runs_8_bits(
     runtime: Runtime, fault: dict[str, Any], why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,6 +221,7 @@ def test_a_session_that_a_full_gpu_refuses_is_no_silent_fallback(runtime: Runtim
         sessions.open_session(model, "cuda")
 
 
+@pytest.mark.usefixtures("exact")
 def test_on_a_full_gpu_all_runs_in_8_bits_on_the_processor(
     runtime: Runtime, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -254,7 +256,7 @@ def test_what_a_stage_says_is_not_warned_of_too(runtime: Runtime, tmp_path: Path
     plan: Any = SimpleNamespace(config=SimpleNamespace(work=SimpleNamespace(device="auto")))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        detector = check_inputs._read_detector(tiny_yolo(tmp_path / "m.onnx", "boxes"), plan)
+        detector = given_files._read_detector(tiny_yolo(tmp_path / "m.onnx", "boxes"), plan)
         in_floating_point()(image()[None])
     assert len(detector.limitations) == 1
     assert detector.limitations == shipped().limitations

@@ -10,7 +10,7 @@ from velfield.detection import runtime
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.graph import network_to_onnx
 from velfield.detection.cnn.inference import Predictor, predict_crops
-from velfield.detection.cnn.quantization import INEXACT, calibrate, is_exact, quantized_to_onnx
+from velfield.detection.cnn.quantization import INEXACT, calibrate, quantized_to_onnx
 from velfield.detection.registry import load_detector, shipped_detector
 
 
@@ -28,12 +28,6 @@ def shipped() -> CnnDetector:
     detector = shipped_detector()
     assert isinstance(detector, CnnDetector)
     return detector
-
-
-@pytest.fixture
-def exact() -> None:
-    if not is_exact():
-        pytest.skip("this processor saturates sums of products of 8 bits")
 
 
 @pytest.mark.usefixtures("exact")
