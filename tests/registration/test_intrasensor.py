@@ -16,8 +16,8 @@ from velfield.registration import intrasensor
 from velfield.registration.alignment import Templates, align_patches, make_templates, smooth_fine
 from velfield.registration.intrasensor import (
     BaseReference,
+    ChainFrame,
     FrameRegistration,
-    _ChainFrame,
     _FrameFitter,
     _PatchHistory,
     map_keypoints,
@@ -328,7 +328,7 @@ def test_patches_that_do_not_align_are_tried_in_turn() -> None:
     base, results = base_of("city"), registered("city", [0])
     (first,) = results
     history = _PatchHistory.begin(base, first)
-    before = _ChainFrame(first, first.transform, seen("city", 0)[0], lambda: seen("city", 0)[1])
+    before = ChainFrame(first, first.transform, seen("city", 0)[0])
     chosen = []
     for _ in range(8):
         chosen.append({tuple(xy) for xy in history.choose(before, (480, 640)).xy})

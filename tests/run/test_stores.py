@@ -129,21 +129,9 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
 def test_layers_are_read_by_zarr_as_written(tmp_path: Path, group: tuple[int, int]) -> None:
     path = tmp_path / "field.zarr"
     layers = {"count": {"dtype": "int32", "units": "1"}, "modal_vx": {"units": "px s-1"}}
-    create_field(
-        path,
-        key="k",
-        height=20,
-        width=30,
-        tile=8,
-        group_tiles=2,
-        velocities_px_per_s=np.arange(3.0),
-        attributes={},
-        layers=layers,
-    )
-    store, window = (
-        open_field(path, "r+"),
-        np.s_[16 * group[0] : 16 * group[0] + 16, 16 * group[1] : 16 * group[1] + 16],
-    )
+    create_empty_field(path, side=20, tile=8, bins=3, layers=layers)
+    store, (y, x) = open_field(path, "r+"), (16 * group[0], 16 * group[1])
+    window = np.s_[y : y + 16, x : x + 16]
     for name, fill in (("count", 0), ("modal_vx", np.nan)):
         written = zarr.open_array(path / name, mode="r")
         values = np.full(written[window].shape, fill, written.dtype)
@@ -159,8 +147,10 @@ def test_layers_are_read_by_zarr_as_written(tmp_path: Path, group: tuple[int, in
         assert not file.exists()
 
 
-def create_empty_field(path: Path, *, side: int, tile: int, bins: int) -> None:
-    """A field of a square map without layers."""
+def create_empty_field(
+    path: Path, *, side: int, tile: int, bins: int, layers: dict[str, dict[str, str]] | None = None
+) -> None:
+    """A field of a square map, by default without layers."""
     create_field(
         path,
         key="k",
@@ -170,7 +160,7 @@ def create_empty_field(path: Path, *, side: int, tile: int, bins: int) -> None:
         group_tiles=min(side // tile, 8),
         velocities_px_per_s=np.arange(float(bins)),
         attributes={},
-        layers={},
+        layers=layers or {},
     )
 
 

@@ -201,7 +201,7 @@ def register_chain(
     lens: Lens,
     config: RegistrationConfig,
     first_previous: Keypoints | None = None,
-    known: "KnownFrame | None" = None,
+    before: "ChainFrame | None" = None,
 ) -> list[FrameRegistration]:
     """Register a chain of frames in the order of time, or against it; results in the order of the frames.
 
@@ -211,12 +211,12 @@ def register_chain(
         (index, grey (h, w) uint8, function that detects its keypoints in raw px) of each.
     first_previous
         Keypoints of the frame before the first, in base px (see `map_keypoints`); None: the chain begins here.
-    known
-        A frame from which optical flow may start the first.
+    before
+        A frame of known map from which optical flow may start the first; its keypoints are not used.
     """
     results: list[FrameRegistration] = []
     by_flow = config.start == "optical_flow" and config.model != "polyprojective"
-    before = known.as_before(base) if known is not None and by_flow else None
+    latest: tuple[Callable[[], Keypoints], FrameTransform] | None = None
     first: FrameRegistration | None = None
     history: _PatchHistory | None = None
     for _, grey, detect in frames:
@@ -230,45 +230,34 @@ def register_chain(
             result = None if result is None or _is_worse(result, first) else result
             first = first or result
         if result is None:
-            previous = (
-                first_previous if before is None or first is None else map_keypoints(before.detect(), before.transform)
-            )
+            previous = first_previous if latest is None else map_keypoints(latest[0](), latest[1])
             result = register_frame(grey, detect(), base, lens, config, previous)
             first = result if result.ok else first
         results.append(result)
         if result.transform is not None:
-            before = _ChainFrame(result, result.transform, small, detect)
+            before, latest = ChainFrame(result, result.transform, small), (detect, result.transform)
             if history is not None:
                 history.note(result)
     return results
 
 
 @dataclass(frozen=True, eq=False)
-class KnownFrame:
-    """A frame (h, w) uint8 whose map to the base image is known, to a few pixels, without registration."""
-
-    grey: GreyImage
-    transform: FrameTransform
-    detect: Callable[[], Keypoints]
-
-    def as_before(self, base: BaseReference) -> "_ChainFrame":
-        """As if it had been registered, by all patches of the base image that it shows."""
-        xy_base = base.templates.xy.astype(np.float64)
-        xy_raw = self.transform.to_raw(xy_base)
-        shown = ((xy_raw >= 0) & (xy_raw <= np.array(self.grey.shape[::-1]) - 1)).all(axis=1)
-        points = ControlPoints(xy_raw[shown], xy_base[shown], np.full(int(shown.sum()), _FLOW_SIGMA_PX))
-        result = FrameRegistration(self.transform, "ok", control_points=points)
-        return _ChainFrame(result, self.transform, shrink(self.grey), self.detect)
-
-
-@dataclass(frozen=True, eq=False)
-class _ChainFrame:
-    """A registered frame that the next one starts from."""
+class ChainFrame:
+    """A frame that the next one starts from: its registration and map, and the frame as by `shrink`."""
 
     result: FrameRegistration
     transform: FrameTransform
     small: GreyImage
-    detect: Callable[[], Keypoints]
+
+    @classmethod
+    def of_known_map(cls, grey: GreyImage, transform: FrameTransform, base: BaseReference) -> "ChainFrame":
+        """A frame (h, w) uint8 whose map is known to a few pixels, as if it had been registered by all patches that it
+        shows of the base image."""
+        xy_base = base.templates.xy.astype(np.float64)
+        xy_raw = transform.to_raw(xy_base)
+        shown = ((xy_raw >= 0) & (xy_raw <= np.array(grey.shape[::-1]) - 1)).all(axis=1)
+        points = ControlPoints(xy_raw[shown], xy_base[shown], np.full(int(shown.sum()), _FLOW_SIGMA_PX))
+        return cls(FrameRegistration(transform, "ok", control_points=points), transform, shrink(grey))
 
 
 @dataclass
@@ -300,7 +289,7 @@ class _PatchHistory:
         self.last_inlier[_are_inliers(self.templates, result)] = self.frame
         self.frame += 1
 
-    def choose(self, before: _ChainFrame, shape: tuple[int, ...]) -> Templates:
+    def choose(self, before: ChainFrame, shape: tuple[int, ...]) -> Templates:
         """Inliers of the last frames, those that the frame before did not show, and some of the others in turn."""
         recent = self.frame - self.last_inlier <= _RETEST_FRAMES
         turn = np.arange(len(self.templates)) % _RETEST_FRAMES == self.frame % _RETEST_FRAMES
@@ -340,7 +329,7 @@ def shrink(grey: ByteArray) -> ByteArray:
 def _register_by_flow(
     grey: GreyImage,
     small: GreyImage,
-    before: _ChainFrame,
+    before: ChainFrame,
     base: BaseReference,
     lens: Lens,
     config: RegistrationConfig,

@@ -26,7 +26,7 @@ from velfield.errors import Failure
 from velfield.parallel import parallel_map, usable_processors
 from velfield.registration import kernels
 from velfield.registration.background import NOT_COVERED, median_of_stack
-from velfield.registration.intrasensor import BaseReference, FrameRegistration, KnownFrame, prepare_base, register_chain
+from velfield.registration.intrasensor import BaseReference, ChainFrame, FrameRegistration, prepare_base, register_chain
 from velfield.registration.joint import ControlPoints
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, fit_normalisation
@@ -147,7 +147,7 @@ def build_own_base(
     motion_px, count = np.zeros((height, 2)), 0
     for _ in range(_MAX_ROUNDS):
         reference_image = prepare_base(base, config, mask=mask, frame_shape=grey.shape)
-        known = KnownFrame(grey, grid.transform, partial(detect, reference))
+        known = ChainFrame.of_known_map(grey, grid.transform, reference_image)
         registered = _register_chains(read, detect, _chains(frames, reference), reference_image, known, config)
         if len(registered) < _MIN_FRAMES:
             return Failure(
@@ -175,7 +175,7 @@ def _undistort_reference(grey: GreyImage, lens: Lens) -> tuple[_Grid, GreyImage,
 def _chains(frames: Sequence[int], reference: int) -> list[list[int]]:
     """The frames in short chains that lead away from the reference.
 
-    The reference is a chain of its own: beside it, who fits best of all, every other frame would look gone astray.
+    The reference is a chain of its own: it fits best of all, and beside it every other frame would look worse.
     """
     sides = [one for one in frames if one > reference], [one for one in frames[::-1] if one < reference]
     return [[reference], *(side[k : k + _CHAIN_FRAMES] for side in sides for k in range(0, len(side), _CHAIN_FRAMES))]
@@ -186,14 +186,14 @@ def _register_chains(
     detect: DetectKeypoints,
     chains: Sequence[Sequence[int]],
     base: BaseReference,
-    known: KnownFrame,
+    known: ChainFrame,
     config: RegistrationConfig,
 ) -> dict[int, tuple[FrameTransform, ControlPoints]]:
     """Register chains of frames to the base image: maps and control points of those that succeed."""
 
     def register(chain: Sequence[int]) -> list[FrameRegistration]:
         shown = ((frame, read(frame), partial(detect, frame)) for frame in chain)
-        return register_chain(shown, base, known.transform.lens, config, known=known)
+        return register_chain(shown, base, known.transform.lens, config, before=known)
 
     return {
         frame: (result.transform, result.control_points)
