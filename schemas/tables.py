@@ -58,7 +58,7 @@ DIMENSION_COLUMNS: dict[str, str] = {
 """Dimensions of vehicles, a row a track."""
 
 TRACK_POSITION_COLUMNS: dict[str, str] = {
-    "track_id": "int64",
+    "track_id": "int64",  # -1: none, of a doubtful detection
     "frame": "int32",
     "time_s": "float64",
     "x_px": "float64",

@@ -6,14 +6,23 @@ from pathlib import Path
 import pandas as pd
 
 from schemas.summary import RunSummary
+from schemas.tables import TRACK_POSITION_COLUMNS
 from tests.small_flight import job
 from velfield import open_run
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan
+from velfield.run.run import Run
+from velfield.run.tables import read_tables
 
 
 def ids(table: pd.DataFrame, name: str = "track_id") -> set[int]:
     return set(table[name].tolist())
+
+
+def apart(run: Run, tracks: set[int]) -> pd.DataFrame:
+    """Positions of some doubtful tracks."""
+    table = read_tables(sorted(run.layout.doubtful_positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS)
+    return table[table["track_id"].isin(tracks)]
 
 
 def test_a_doubtful_thing_is_set_apart_and_kept_where_none_is_to_be_doubted(
@@ -28,6 +37,7 @@ def test_a_doubtful_thing_is_set_apart_and_kept_where_none_is_to_be_doubted(
     its = ids(every, "detection_id") - ids(sure, "detection_id")
     assert doubtful <= its  # a track is named after its first detection
     assert not its & ids(run.track_positions(), "detection_id")
+    assert its - ids(apart(run, doubtful), "detection_id")  # in no track
     shutil.copytree(whole[0], tmp_path / "run")
     compute_stages(make_plan(job(flight, tmp_path / "run", "tracking.doubt=false")), ["tracks"])
     again = open_run(tmp_path / "run")

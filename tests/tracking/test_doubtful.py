@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.tracking.doubtful import find_doubtful
+from velfield.tracking.doubtful import find_doubtful, find_lone
 
 METRES = 0.25
 
@@ -64,3 +64,10 @@ def test_what_moves_is_never_doubtful() -> None:
 @pytest.mark.parametrize("made", [Flight(traffic=9), Flight(score=-0.02), Flight(traffic=0)])
 def test_without_a_usual_score_nothing_is_doubtful(made: Flight) -> None:
     assert not made.doubts(120.0, 0.01)
+
+
+def test_a_detection_in_no_track_needs_a_score_above_that_of_a_tenth_of_the_tracks() -> None:
+    detections = pd.DataFrame({"detection_id": range(5), "frame": [3, 3, 3, 3, 9], "score": [0.0, 0.1, 0.2, 0.1, 0.0]})
+    in_tracks = detections[["detection_id", "frame"]].take([3])  # none in frame 9: nothing could be followed there
+    lone = find_lone(detections, in_tracks, pd.Series([0.14, *[0.15] * 18]))
+    assert lone["detection_id"].tolist() == [0, 1]

@@ -277,12 +277,13 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=16,
+        version=17,
         label="tracks",
         lines=(
             Line(
-                "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets, {doubtful:.0f} doubtful ones set aside",
-                lambda counts: bool(counts.get("doubtful")),
+                "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets; {doubtful:.0f} doubtful ones and "
+                "{lone:.0f} detections in no track set aside",
+                lambda counts: bool(counts.get("doubtful", 0) + counts.get("lone", 0)),
             ),
             Line("{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets"),
         ),

@@ -198,7 +198,7 @@ class Run:
         Parameters
         ----------
         doubtful
-            With those of doubtful tracks (`vehicles`).
+            With those of doubtful tracks (`vehicles`), and those of a low score that no track confirms.
         """
         found = self._all_detections(list(DETECTION_COLUMNS))
         if doubtful:

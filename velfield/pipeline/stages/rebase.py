@@ -232,6 +232,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
             write_tracks(written[-1], table)
             ids[name].update(table["track_id"].unique().tolist())
             counts[name] += len(table)
+    lone = 0
     for source, target in (
         (old.track_positions, layout.track_positions),
         (old.doubtful_positions, layout.doubtful_positions),
@@ -241,6 +242,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
             table[["x_px", "y_px"]] = transform(table[["x_px", "y_px"]].to_numpy(np.float64))
             written.append(target / path.name)
             write_table(written[-1], table, TRACK_POSITION_COLUMNS)
+            lone += int((table["track_id"] < 0).sum())
     if rebase.old.dimensions.exists():
         table = read_tables([rebase.old.dimensions], DIMENSION_COLUMNS)
         sizes = ["length_px", "length_sd_px", "width_px", "width_sd_px"]
@@ -251,7 +253,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
         written.append(link_file(rebase.old.joins, plan.layout.joins))
     advance("tracks")
     found = {name: float(len(known)) for name, known in ids.items()}
-    return StageResult(written, found | {"tracklets": float(counts["tracks"])})
+    return StageResult(written, found | {"tracklets": float(counts["tracks"]), "lone": float(lone)})
 
 
 def map_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:

@@ -38,7 +38,7 @@ from velfield.tracking.dimensions import (
     sample_tracks,
 )
 from velfield.tracking.doubles import find_doubles, find_split_tracks
-from velfield.tracking.doubtful import find_doubtful
+from velfield.tracking.doubtful import find_doubtful, find_lone
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
@@ -89,10 +89,12 @@ def chain_tracks(plan: Plan) -> StageResult:
         found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
-    doubtful = np.empty(0, np.int64)
+    doubtful, sure_scores = np.empty(0, np.int64), None
     if plan.config.tracking.doubt and _has_network(layout):
         seen = positions[positions["source"] < 2]
-        doubtful = find_doubtful(seen, mean_scores(plan, seen), gsd_m)
+        scores = mean_scores(plan, seen)
+        doubtful = find_doubtful(seen, scores, gsd_m)
+        sure_scores = scores.drop(doubtful)
         del seen
     apart = positions[positions["track_id"].isin(doubtful)].reset_index(drop=True)
     positions = _without(positions, doubtful)
@@ -100,11 +102,14 @@ def chain_tracks(plan: Plan) -> StageResult:
     del strips
     triples = find_triples(positions, flight, plan.config.tracking.max_interval_s)
     track = found.tracks[chain]
-    output = _Output(plan, first_frame, track, positions, apart, flight, triples, np.unique(triples.ids), doubles)
+    output = _Output(
+        plan, first_frame, track, positions, apart, flight, triples, np.unique(triples.ids), doubles, sure_scores
+    )
     count = min(usable_processors(), _AT_ONCE, len(plan.units))
     runs = np.array_split(np.arange(len(plan.units)), max(count, 1))
     parts = parallel_map(output.write, [run for run in runs if len(run)])
-    written, recovered = [path for paths, _ in parts for path in paths], sum(number for _, number in parts)
+    written = [path for paths, _, _ in parts for path in paths]
+    recovered, lone = sum(number for _, number, _ in parts), sum(number for _, _, number in parts)
     for folder in (layout.tracks, layout.track_positions, layout.doubtful, layout.doubtful_positions):
         for stale in set(folder.glob("unit-*.parquet")) - set(written):
             stale.unlink()  # of an earlier plan with more units
@@ -122,6 +127,7 @@ def chain_tracks(plan: Plan) -> StageResult:
         "recovered": float(recovered),
         "tracks": float(len(np.unique(kept))),
         "doubtful": float(len(doubtful)),
+        "lone": float(lone),
     }
     return StageResult(written, counts, warnings=warnings)
 
@@ -350,7 +356,7 @@ class _Output:
 
     ``first_frame`` and ``track`` (n,) of the tracklets of all units, by frame; ``positions`` by frame, without
     the tracks that are ``doubles``, those that are ``doubtful`` ``apart``; ``triples``, and the ``ids`` (m,) of their
-    detections, ascending.
+    detections, ascending; ``sure_scores``, the mean score of the other tracks, if doubt is asked for.
     """
 
     plan: Plan
@@ -362,33 +368,37 @@ class _Output:
     triples: _Triples
     ids: IntArray
     doubles: IntArray
+    sure_scores: pd.Series | None
 
     @cached_property
     def doubtful(self) -> IntArray:
         """Tracks that are set apart, ascending."""
         return np.unique(self.apart["track_id"].to_numpy(np.int64))
 
-    def write(self, units: IntArray) -> tuple[list[Path], int]:
-        """The files of consecutive units, and how many tracklets in them only tracks confirm.
+    def write(self, units: IntArray) -> tuple[list[Path], int, int]:
+        """The files of consecutive units, how many tracklets in them only tracks confirm, and detections no track.
 
         Data read from a unit are kept only until the next one is written: units can be long.
         """
-        written, recovered = [], 0
+        written, recovered, lone = [], 0, 0
         kept: dict[int, UnitDetections] = {}
         for unit in units.tolist():
             kept = {k: one for k, one in kept.items() if k >= unit}
-            paths, number = self._write_unit(unit, kept)
+            paths, number = self._write_tracklets(unit, kept)
             written += paths
             recovered += number
-        return written, recovered
+            paths, number = self._write_positions(unit)
+            written += paths
+            lone += number
+        return written, recovered, lone
 
-    def _write_unit(self, unit: int, kept: dict[int, UnitDetections]) -> tuple[list[Path], int]:
-        layout, frames = self.plan.layout, self.plan.units[unit]
+    def _write_tracklets(self, unit: int, kept: dict[int, UnitDetections]) -> tuple[list[Path], int]:
+        layout = self.plan.layout
         written, recovered = [], 0
         path = layout.unit_file(layout.tracklets, unit)
         if path.exists():
             table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
-            begin = np.searchsorted(self.first_frame, frames.start)
+            begin = np.searchsorted(self.first_frame, self.plan.units[unit].start)
             table["track_id"] = self.track[begin : begin + len(table)]
             table = _without(table, self.doubles)
             is_doubtful = among(table["track_id"].to_numpy(np.int64), self.doubtful)
@@ -401,11 +411,28 @@ class _Output:
             table = table.sort_values(["frame_0", "tracklet_id"], kind="stable", ignore_index=True)
             written.append(layout.tracks / path.name)
             write_tracks(written[-1], table)
-        for folder, positions in ((layout.track_positions, self.positions), (layout.doubtful_positions, self.apart)):
-            rows = slice(*np.searchsorted(positions["frame"].to_numpy(), [frames.start, frames.stop]))
-            written.append(layout.unit_file(folder, unit))
-            write_table(written[-1], positions[rows], TRACK_POSITION_COLUMNS)
         return written, recovered
+
+    def _write_positions(self, unit: int) -> tuple[list[Path], int]:
+        layout, frames = self.plan.layout, self.plan.units[unit]
+        sure, apart = (
+            table[slice(*np.searchsorted(table["frame"].to_numpy(), [frames.start, frames.stop]))]
+            for table in (self.positions, self.apart)
+        )
+        lone = self._lone(unit, pd.concat([sure, apart]))
+        written = [layout.unit_file(folder, unit) for folder in (layout.track_positions, layout.doubtful_positions)]
+        for path, table in zip(written, (sure, pd.concat([apart, lone])), strict=True):
+            write_table(path, table, TRACK_POSITION_COLUMNS)
+        return written, len(lone)
+
+    def _lone(self, unit: int, in_tracks: pd.DataFrame) -> pd.DataFrame:
+        """Detections of a unit that are doubtful as no track has them, with -1 for one."""
+        path = self.plan.layout.unit_file(self.plan.layout.detections, unit)
+        if self.sure_scores is None or not path.exists():
+            return empty_table(TRACK_POSITION_COLUMNS)
+        names = ["detection_id", "frame", "time_s", "x_px", "y_px", "score"]
+        detections = read_tables([path], DETECTION_COLUMNS, only=names)
+        return find_lone(detections, in_tracks[in_tracks["source"] < 2], self.sure_scores).assign(track_id=-1, source=0)
 
     def _recovered(self, unit: int, kept: dict[int, UnitDetections]) -> pd.DataFrame:
         plan, frames = self.plan, self.plan.units[unit]
