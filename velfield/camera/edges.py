@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
-from velfield.compiled import kernel
+from velfield.compiled import compiled, kernel
 from velfield.parallel import parallel_map
 
 _MIN_POINTS_PER_ARC, _MAX_POINTS_PER_ARC = 10, 24  # after pooling
@@ -166,30 +166,38 @@ def _link_chains(
     return order[:used].copy(), np.array(starts)
 
 
-@kernel
+@compiled(error_model="numpy")
 def _fit_parabola(
     points: Float32Array, order: IntArray, begin: int, end: int, out: FloatArray
-) -> tuple[float, float, float, float, float, NDArray[np.floating]]:
+) -> tuple[float, float, float, float, float, tuple[float, float, float]]:
     """Least-squares parabola over the chord of a piece of chain; writes the residuals, returns axes and terms."""
     first, last = order[begin], order[end - 1]
     ox, oy = points[first, 0], points[first, 1]
     tx, ty = points[last, 0] - ox, points[last, 1] - oy
     chord = max(np.sqrt(tx * tx + ty * ty), 1e-6)
     tx, ty = tx / chord, ty / chord
-    moments = np.zeros((3, 3))
-    right = np.zeros(3)
+    n = s2 = s4 = 1e-9
+    s1 = s3 = r0 = r1 = r2 = 0.0  # sums of s**k, and of s**k d
     for i in range(begin, end):
         dx, dy = points[order[i], 0] - ox, points[order[i], 1] - oy
         s = (dx * tx + dy * ty) / chord
         d = dy * tx - dx * ty
-        powers = (1.0, s, s * s)
-        for a in range(3):
-            right[a] += powers[a] * d
-            for b in range(3):
-                moments[a, b] += powers[a] * powers[b]
-    for a in range(3):
-        moments[a, a] += 1e-9
-    terms = np.linalg.solve(moments, right)
+        n += 1.0
+        s1 += s
+        s2 += s**2
+        s3 += s**3
+        s4 += s**4
+        r0 += d
+        r1 += s * d
+        r2 += s**2 * d
+    # Elimination by hand: numba takes seconds to compile numpy's solver.
+    a, b = s1 / n, s2 / n
+    m11, m12, m22 = s2 - a * s1, s3 - a * s2, s4 - b * s2
+    q1, q2 = r1 - a * r0, r2 - b * r0
+    c = m12 / m11
+    t2 = (q2 - c * q1) / (m22 - c * m12)
+    t1 = (q1 - m12 * t2) / m11
+    terms = (r0 - s1 * t1 - s2 * t2) / n, t1, t2
     for i in range(begin, end):
         dx, dy = points[order[i], 0] - ox, points[order[i], 1] - oy
         s = (dx * tx + dy * ty) / chord

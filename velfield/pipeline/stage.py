@@ -150,7 +150,7 @@ STAGES: tuple[Stage, ...] = (
     # Calibrate from edge points and control points of frames spread over the flight.
     Stage(
         name="lens",
-        version=9,
+        version=10,
         label="lens",
         lines=(
             Line("no significant distortion; pinhole model used", lambda counts: not counts.get("corner_px")),

@@ -297,7 +297,7 @@ def resample_cells(
     cells
         (n, 2) row and column of cells of `CELL_PX`.
     """
-    resample_kernel(extended, as_words(extended), coarse, step, cells, image, valid)
+    resample_kernel(extended, as_words(extended), coarse, step, np.ascontiguousarray(cells), image, valid)
 
 
 def _raw_px_per_cell(coarse: FloatArray) -> float:

@@ -147,11 +147,11 @@ def _draw_vehicles(out, occluder, pose, shape, tones, box, table, pinhole, lens,
             for j in range(box[n, 0], box[n, 2] + 1):
                 if occluder[i, j] == 1:
                     continue
-                a, b, sa, sb = _ray(j, i, pose[n], table, pinhole, lens)
+                a, b, sa, sb = _ray(float(j), float(i), pose[n], table, pinhole, lens)
                 if np.hypot(a, b) > far + max(lean, pose[n, 8] * np.hypot(sa, sb)):
                     continue
-                ra, rb, _, _ = _ray(j + step, i, pose[n], table, pinhole, lens)
-                da, db, _, _ = _ray(j, i + step, pose[n], table, pinhole, lens)
+                ra, rb, _, _ = _ray(j + step, float(i), pose[n], table, pinhole, lens)
+                da, db, _, _ = _ray(float(j), i + step, pose[n], table, pinhole, lens)
                 c, s = np.cos(pose[n, 2]), np.sin(pose[n, 2])
                 covered, light, grey = 0, 0.0, 0.0
                 for p in range(SAMPLES):
@@ -251,7 +251,7 @@ def draw_vehicles(
         _draw_vehicles(
             out,
             occluder,
-            vehicles.pose,
+            np.ascontiguousarray(vehicles.pose),
             vehicles.shape,
             vehicles.tones,
             vehicles.box,

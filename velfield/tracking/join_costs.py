@@ -118,7 +118,8 @@ def find_candidates(
     low = np.searchsorted(times, ends.time_s, side="right")
     high = np.searchsorted(times, ends.time_s + longest, side="right")
     bounds = np.array([limits.moving_s, limits.stationary_s, limits.hidden_s, limits.stationary_speed_m_per_s])
-    sides = [(one.time_s, one.position_m, one.velocity_m_per_s, one.speed_m_per_s, slack) for one in (ends, starts)]
+    columns = [(one.time_s, one.position_m, one.velocity_m_per_s, one.speed_m_per_s, slack) for one in (ends, starts)]
+    sides = [tuple(np.array(column, order="C") for column in side) for side in columns]  # one layout: compiled once
     total = np.cumsum(np.maximum(high - low, 0))
     found = []
     for block in np.split(np.arange(len(total)), np.flatnonzero(np.diff(total // _PAIRS_AT_ONCE)) + 1):
