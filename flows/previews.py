@@ -16,7 +16,7 @@ from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.pipeline.stage import FIELD_STAGES
-from velfield.pipeline.units import WHOLE
+from velfield.run.commits import WHOLE
 from velfield.run.layout import is_remote
 
 WORTH_S = 30.0

@@ -26,7 +26,7 @@ from velfield.pipeline.check_inputs import validate_inputs
 from velfield.pipeline.estimate import check_space, disk_full_as_input_error
 from velfield.pipeline.plan import Plan, changed_since, dropped_inputs, make_plan, write_flight_record
 from velfield.pipeline.summary import summarise_run
-from velfield.run.commits import sweep_partial
+from velfield.run.commits import remove_analysis, sweep_partial
 from velfield.run.layout import RunLayout, is_remote, remove_tree
 from velfield.run.lock import locked
 
@@ -109,6 +109,8 @@ def record_start(plan: Plan, what: str, console: Console) -> None:
     if changed:
         text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
         console.event("changed", f"{plan.layout.root}: {text}", changed=changed)
+    for line in remove_analysis(plan.layout, unless=plan.keys):
+        console.warn(line)
 
 
 def publish_report(plan: Plan, summary: RunSummary, runner: Runner, console: Console, by: Orchestration) -> None:

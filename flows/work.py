@@ -18,8 +18,8 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGE, STAGES, Cut, Stage
 from velfield.pipeline.summary import summarise_stage
-from velfield.pipeline.units import WHOLE, Unit, discard_unit, prepare_stage, stage_units
-from velfield.run.commits import read_commits
+from velfield.pipeline.units import Unit, discard_unit, prepare_stage, stage_units
+from velfield.run.commits import WHOLE, read_commits
 
 GraphOf = Callable[[Plan, Stage, Unit], Any]
 """The Dask graph of a unit."""

@@ -29,10 +29,10 @@ def test_a_doubtful_thing_is_set_apart_and_kept_where_none_is_to_be_doubted(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
 ) -> None:
     run = open_run(whole[0])
-    vehicles = run.vehicles()
+    vehicles = run.vehicles(doubtful=True)
     doubtful = ids(vehicles[vehicles["doubtful"]])
     assert doubtful
-    assert ids(run.tracklets()) == ids(run.track_positions()) == ids(vehicles) - doubtful
+    assert ids(run.tracklets()) == ids(run.track_positions()) == ids(run.vehicles()) == ids(vehicles) - doubtful
     every, sure = run.detections(doubtful=True), run.detections()
     its = ids(every, "detection_id") - ids(sure, "detection_id")
     assert doubtful <= its  # a track is named after its first detection
@@ -41,6 +41,6 @@ def test_a_doubtful_thing_is_set_apart_and_kept_where_none_is_to_be_doubted(
     shutil.copytree(whole[0], tmp_path / "run")
     compute_stages(make_plan(job(flight, tmp_path / "run", "tracking.doubt=false")), ["tracks"])
     again = open_run(tmp_path / "run")
-    assert not again.vehicles()["doubtful"].any()
+    assert not again.vehicles(doubtful=True)["doubtful"].any()
     assert doubtful <= ids(again.tracklets())
     assert ids(again.detections(), "detection_id") == ids(every, "detection_id")

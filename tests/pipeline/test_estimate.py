@@ -1,5 +1,6 @@
 """Scale: what is planned for four hours, and that a driver's memory does not grow with the flight."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -64,6 +65,24 @@ def test_changed_inputs_and_settings_are_known(flight: Path, tmp_path: Path) -> 
     assert changed_since(make_plan(given)) == ["base", "settings"]
     first.layout.flight.write_text('{"format_version": 999}')
     assert changed_since(first) == []
+
+
+def test_the_folder_of_another_flight_is_refused(flight: Path, tmp_path: Path) -> None:
+    def plan_with(frames: Path) -> Plan:
+        made = job(flight, tmp_path / "run")
+        return make_plan(made.model_copy(update={"inputs": made.inputs.model_copy(update={"source": str(frames)})}))
+
+    grows, moved = tmp_path / "grows", tmp_path / "moved"
+    for folder in (grows, moved):
+        shutil.copytree(job(flight, tmp_path / "run").inputs.source, folder)
+    last = max(grows.glob("*.png"))
+    last.rename(tmp_path / last.name)
+    write_flight_record(plan_with(grows))
+    with pytest.raises(InputError, match=r"run holds the run of .*grows, which that of .*moved would overwrite"):
+        plan_with(moved)
+    shutil.move(tmp_path / last.name, last)
+    write_flight_record(plan_with(grows))
+    plan_with(moved)  # of the same content
 
 
 @pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 
 from flows.commands.verify import verify
+from flows.console import Console
+from flows.process_flight import record_start
 from schemas.summary import RunSummary
 from tests.faults.flipped_bits import flip_bits
-from tests.small_flight import digests
+from tests.small_flight import digests, job
 from velfield import open_run
 from velfield.errors import InputError, StoreError
 from velfield.pipeline.analysis.analyse import analyse_run
+from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stage import STAGE
 from velfield.pipeline.verify import invalidate, verify_run
 from velfield.run.commits import commit_path, read_commit, read_commits
@@ -88,6 +91,19 @@ def test_a_damaged_flight_record_is_refused_with_what_to_do(copy: Path) -> None:
 def test_a_damaged_page_is_found(copy: Path) -> None:
     flip_a_bit(copy / "view/run.json", np.random.default_rng(SEED))
     assert found(copy) == {"view/run.json": "damaged"}
+
+
+def test_an_analysis_of_other_results_does_not_outlive_them(
+    copy: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    list(analyse_run(copy))
+    console = Console("normal")
+    record_start(make_plan(job(flight, copy)), "the same again", console)
+    assert (copy / "analysis/analysis.json").exists()
+    record_start(make_plan(job(flight, copy, "tracking.max_turn_rad=0.4")), "with another limit", console)
+    assert not (copy / "analysis").exists()
+    assert f"`velfield analyse {copy}` makes it again" in " ".join(capsys.readouterr().err.split())
+    assert not [name for name in found(copy) if "analysis" in name]
 
 
 def test_a_damaged_analysis_is_found_and_made_again_as_it_was(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,13 +16,14 @@ from schemas.summary import RunSummary
 from schemas.view import ViewRecord
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, served
 from velfield.analysis.vehicle_classes import CLASS_NAMES
+from velfield.analysis.vehicles import STATES
 from velfield.field.segments import SEGMENT_DTYPE, stationary_speed_px_per_s
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.stores import open_field
 from velfield.viewer.flow import DRAWS, _draw_tile
-from velfield.viewer.replay import CHUNK_S, chunk_count, replay_chunks, vehicle_paths
+from velfield.viewer.replay import CHUNK_S, chunk_count, position_step, replay_chunks, vehicle_paths
 
 PAINTED = """(() => {
   const canvas = document.querySelector('canvas.animation');
@@ -109,6 +110,21 @@ def test_no_vehicles_make_files_too() -> None:
     vehicles = pd.DataFrame({"state": [], "vehicle_class": []} | {name: np.zeros(0) for name in numbers})
     (chunk,) = replay_chunks(paths, vehicles, first_time_s=0.0, duration_s=3.0, step_px=1.0)
     assert decode(chunk, 1.0) == {}
+
+
+def test_each_vehicle_of_the_replay_is_drawn_by_its_own_row(run: Run, record: ViewRecord) -> None:
+    """Where there are doubtful tracks, which have rows of `vehicles` and no segments."""
+    assert run.vehicles(doubtful=True)["doubtful"].any()
+    tracks = np.unique(run.segments()["track"])
+    vehicles = run.vehicles().set_index("track_id")
+    shown = set()
+    for path in sorted((run.layout.view / "replay").glob("*.bin")):
+        for number, drawn in decode(path.read_bytes(), position_step(record.width_px, record.height_px)).items():
+            row = vehicles.loc[tracks[number]]
+            assert STATES[drawn["state"]] == row["state"]
+            assert drawn["length"] == round(10 * row["length_m"])
+            shown.add(number)
+    assert len(shown) == len(vehicles)
 
 
 def draw_bins(weights: IntArray) -> IntArray:

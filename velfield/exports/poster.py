@@ -79,7 +79,7 @@ def _facts(run: Run, options: ExportOptions) -> list[str]:
     times = run.times_s[np.isfinite(run.times_s)]
     seconds = float(np.ptp(times)) if len(times) else 0.0
     vehicles = run.vehicles()
-    states = vehicles.loc[~vehicles["doubtful"], "state"]
+    states = vehicles["state"]
     count = run.field.count()
     facts = [_date(run, options), f"{seconds:.0f} s of video"]
     facts += [f"n = {int((states != 'parked').sum())} vehicles in traffic"]

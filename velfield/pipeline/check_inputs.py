@@ -6,7 +6,7 @@ from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut
-from velfield.pipeline.units import WHOLE
+from velfield.run.commits import WHOLE
 
 _LONG_PX = 50_000_000
 """Pixels of all frames above which decoding them takes longer than the check of the base image."""

@@ -32,8 +32,7 @@ from velfield.pipeline.stages.georeference import (
 from velfield.pipeline.stages.rebase import describe_source
 from velfield.pipeline.stages.report import write_report
 from velfield.pipeline.summary import summarise_run, summarise_stage
-from velfield.pipeline.units import WHOLE
-from velfield.run.commits import read_commits, write_atomically
+from velfield.run.commits import WHOLE, read_commits, remove_analysis, write_atomically
 from velfield.run.flight_record import check_format
 from velfield.run.frame_transforms import read_first_georeference, read_georeference
 from velfield.run.layout import RunLayout, remove_tree, to_path
@@ -123,7 +122,7 @@ def georeference(
             compute_stages(plan, ("field",))
         compute_stages(plan, ("maps",))
         write_report(plan, _summary(plan))
-        notes = [*_notes(before_m, fitted, changed), *_list_outdated(run.layout)]
+        notes = [*_notes(before_m, fitted, changed), *remove_analysis(run.layout)]
     return Georeferenced(fitted, record, tuple(notes))
 
 
@@ -162,14 +161,6 @@ def _vehicle_counts(layout: RunLayout, stage: str) -> dict[str, float]:
         for key, value in record.counts.items()
         if key in ("vehicles", "vehicle_gsd_m")
     }
-
-
-def _list_outdated(layout: RunLayout) -> list[str]:
-    """Notes on results that were computed with the previous place and scale and are not recomputed here."""
-    if not layout.analysis.exists():
-        return []
-    again = f"`velfield analyse {layout.root}`"
-    return [f"the analysis is of the place and scale before, as are files exported so far: run {again}, export again"]
 
 
 def _record(before: GeoreferenceRecord, points: ControlPointsRecord) -> GeoreferenceRecord:

@@ -138,7 +138,8 @@ def make_plan(job: Job) -> Plan:
     Raises
     ------
     InputError
-        The source cannot be read, has no times, or fewer than three frames are left.
+        The source cannot be read, has no times, or fewer than three frames are left; or the folder holds another
+        flight.
     """
     check_format(Path(job.root))
     job = _with_telemetry(job)
@@ -155,6 +156,7 @@ def make_plan(job: Job) -> Plan:
     inputs = _digest_inputs(job, info)
     plan = Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
     _ = plan.time_intervals  # refuses impossible intervals now, not where the field is built
+    check_same_flight(plan)
     return plan
 
 
@@ -225,6 +227,30 @@ def dropped_inputs(plan: Plan) -> list[str]:
         for name in OPTIONAL_INPUTS
         if before is not None and (path := getattr(before, name)) and not getattr(plan.job.inputs, name)
     ]
+
+
+def check_same_flight(plan: Plan) -> None:
+    """See that the folder holds no other flight, whose results would be overwritten.
+
+    The same file with other content, such as a folder of frames that grows, and the same content elsewhere are the same
+    flight.
+
+    Raises
+    ------
+    InputError
+        It does.
+    """
+    try:
+        old = read_flight_record(plan.layout.root) if plan.layout.flight.exists() else None
+    except InputError:
+        return  # a record that cannot be read protects nothing
+    if old is None or old.given is None or old.inputs.source.digest == plan.inputs.source.digest:
+        return
+    if old.given.source != plan.job.inputs.source:
+        raise InputError(
+            f"{plan.layout.root} holds the run of {old.given.source}, which that of {plan.job.inputs.source} would "
+            "overwrite; give another --out, or remove the folder first"
+        )
 
 
 def changed_since(plan: Plan) -> list[str]:

@@ -5,9 +5,8 @@ from typing import Any
 
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import Cut, Stage, resolve
-from velfield.run.commits import commit_path, read_commit
+from velfield.run.commits import WHOLE, commit_path, read_commit
 
-WHOLE = "all"
 """Name of the one unit of a stage that is not cut."""
 
 

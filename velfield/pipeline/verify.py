@@ -10,8 +10,7 @@ from pathlib import Path
 from schemas.records import CommitRecord, FlightRecord
 from velfield.errors import InputError
 from velfield.pipeline.stage import STAGE, Cut
-from velfield.pipeline.units import WHOLE
-from velfield.run.commits import ANALYSIS, PAGE, commit_path, digest_file, read_commit, read_commits
+from velfield.run.commits import ANALYSIS, PAGE, WHOLE, commit_path, digest_file, read_commit, read_commits
 from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.results import read_results
 from velfield.run.stores import is_of_creation

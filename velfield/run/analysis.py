@@ -74,8 +74,7 @@ class RunAnalysis:
         if self.vehicles is None:
             return TrafficAnalysis(self.trajectories, classes=self._classes)
         known = self.vehicles()
-        is_parked = ((known["state"] == "parked") & ~known["doubtful"]).to_numpy()
-        parked = known.loc[is_parked, ["x_px", "y_px", "orientation_rad"]]
+        parked = known.loc[known["state"] == "parked", ["x_px", "y_px", "orientation_rad"]]
         scale = [self.gsd_m, self.gsd_m, 1.0]
         return TrafficAnalysis(self.trajectories, parked=parked.to_numpy(np.float64) * scale, classes=self._classes)
 

@@ -9,7 +9,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.records import FORMAT_VERSION, CommitRecord, SealedRecord
 from velfield.errors import parse_json
-from velfield.run.layout import RunLayout, is_remote
+from velfield.run.layout import RunLayout, is_remote, remove_tree
 
 _WHOLE_FILE_BYTES = 256 * 2**20
 _SAMPLE_BYTES = 2**20
@@ -29,7 +29,7 @@ _SYNCED_AT_ONCE = 8
 """Files: 650 of a short clip's field take 0.13 s, one after another 1.3 s."""
 _DIGEST = "digest"
 """Key of a record of which the digest of all others is the value."""
-PAGE, ANALYSIS, _WHOLE = "page", "analysis", "all"
+PAGE, ANALYSIS, WHOLE = "page", "analysis", "all"
 """Names of the commit records of the page and of the analysis, which are no stages, and of their one unit."""
 POSITION_SD_M = "position_sd_m"
 """Count of the stage of given tracks: the standard deviation of a smoothed position along one axis, m."""
@@ -195,15 +195,34 @@ def record_page(layout: RunLayout) -> None:
     _record_files(layout, PAGE, [layout.report, *view])
 
 
-def record_analysis(layout: RunLayout, *, slice_s: float) -> None:
-    """Record the files of the analysis, and with which slices of time it was made, likewise."""
+def record_analysis(layout: RunLayout, keys: Mapping[str, str], *, slice_s: float) -> None:
+    """Record the files of the analysis, and with which slices of time it was made, likewise; and of which results, by
+    the content keys of the stages."""
     files = [path for path in layout.analysis.rglob("*") if path.is_file()]
-    _record_files(layout, ANALYSIS, files, slice_s=slice_s)
+    _record_files(layout, ANALYSIS, files, key=_analysed(keys), slice_s=slice_s)
 
 
-def _record_files(layout: RunLayout, name: str, files: Iterable[Path], **counts: float) -> None:
+def _analysed(keys: Mapping[str, str]) -> str:
+    """The key of what an analysis reads: the tracks, and their scale, which a run of given tracks has no stage for."""
+    return keys.get("scale") or keys["tracks"]
+
+
+def remove_analysis(layout: RunLayout, *, unless: Mapping[str, str] | None = None) -> list[str]:
+    """Remove the analysis, unless it is of the results with these keys; a line that says so.
+
+    The page and the report would show it beside what was computed since.
+    """
+    record = read_commit(layout, ANALYSIS, WHOLE)
+    if record is None or (unless is not None and record.key == _analysed(unless)):
+        return []
+    remove_tree(layout.analysis)
+    commit_path(layout, ANALYSIS, WHOLE).unlink()
+    return [f"the analysis was of the results before and is removed; `velfield analyse {layout.root}` makes it again"]
+
+
+def _record_files(layout: RunLayout, name: str, files: Iterable[Path], *, key: str = "", **counts: float) -> None:
     outputs = digest_outputs(layout, sorted(files))
-    record = CommitRecord(stage=name, unit=_WHOLE, key="", outputs=outputs, counts=counts, code_version=code_version())
+    record = CommitRecord(stage=name, unit=WHOLE, key=key, outputs=outputs, counts=counts, code_version=code_version())
     write_commit(layout, record)
 
 

@@ -230,18 +230,22 @@ class Run:
         self.require_frames()
         return read_tables(sorted(folder.glob("unit-*.parquet")), TRACK_COLUMNS, only=list(names))
 
-    def vehicles(self) -> pd.DataFrame:
-        """One row a track: when and where, its length, width and class, whether it moves, waits in a lane or is
-        parked, and whether it is doubtful: `find_vehicles`, `add_dimensions`.
+    def vehicles(self, *, doubtful: bool = False) -> pd.DataFrame:
+        """One row a track, by ``track_id``: when and where, its length, width and class, and whether it moves, waits in
+        a lane or is parked: `find_vehicles`, `add_dimensions`.
 
-        Doubtful things stand far from vehicles, with a low score (`velfield.tracking.doubtful`); no other table has
-        them.
+        Parameters
+        ----------
+        doubtful
+            With the rows of doubtful tracks, whose ``doubtful`` is true: things that stand far from vehicles, with a
+            low score (`velfield.tracking.doubtful`). No other table has them.
         """
-        gsd_m = self.grid.gsd_m
-        parts = [self._tracklets_of(folder, VEHICLE_COLUMNS) for folder in (self.layout.tracks, self.layout.doubtful)]
+        gsd_m, layout = self.grid.gsd_m, self.layout
+        folders = [layout.tracks, layout.doubtful] if doubtful else [layout.tracks]
+        parts = [self._tracklets_of(folder, VEHICLE_COLUMNS) for folder in folders]
         seen = self._all_detections(["detection_id", "orientation_rad", "score"])
         vehicles = find_vehicles(pd.concat(parts, ignore_index=True), seen, gsd_m=gsd_m)
-        vehicles = vehicles.assign(doubtful=vehicles["track_id"].isin(parts[1]["track_id"]))
+        vehicles = vehicles.assign(doubtful=~vehicles["track_id"].isin(parts[0]["track_id"]))
         return add_dimensions(vehicles, self._dimensions(), gsd_m)
 
     def _dimensions(self) -> pd.DataFrame:

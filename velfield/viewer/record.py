@@ -76,6 +76,7 @@ def write_view_data(layout: RunLayout) -> list[Path]:
 
 def _write_animations(run: Run, segments: Segments, vehicles: pd.DataFrame) -> list[Path]:
     """Write what the page animates: the tracks, and draws from the field."""
+    vehicles = vehicles.set_index("track_id").loc[np.unique(segments["track"])]
     grid, view = run.grid, run.layout.view
     first_s, last_s = _span(run.times_s)
     chunks = replay_chunks(

@@ -112,7 +112,7 @@ def replay_chunks(
     Parameters
     ----------
     vehicles
-        `find_vehicles` and `add_dimensions`, a row a track.
+        `find_vehicles` and `add_dimensions`, a row a track, in the order of track ids.
     """
     time_s = paths.time_s - first_time_s
     begins = np.flatnonzero(paths.vehicle[1:] == paths.vehicle[:-1])  # positions with another after them

@@ -65,7 +65,7 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
             frames=_frames(run),
             speed_unit=speed_unit,
         )
-        record_analysis(run.layout, slice_s=slice_s)
+        record_analysis(run.layout, run.record.keys, slice_s=slice_s)
 
 
 def _frames(run: Run) -> Frames | None:

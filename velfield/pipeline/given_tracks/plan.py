@@ -9,7 +9,7 @@ from schemas.records import InputsRecord, SourceRecord
 from velfield.errors import InputError
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.pipeline.given_tracks.write import frame_times
-from velfield.pipeline.plan import Plan
+from velfield.pipeline.plan import Plan, check_same_flight
 from velfield.pipeline.stage import STAGES, Stage, stage_keys
 from velfield.run.commits import digest_path
 from velfield.sources.source import SourceInfo
@@ -80,4 +80,5 @@ def plan_tracks(job: Job) -> Plan:
         keys={stage.name: keys[stage.name] for stage in list_track_stages()},  # of the others `verify` asks nothing
     )
     _ = plan.time_intervals  # refuses impossible intervals now
+    check_same_flight(plan)
     return plan
