@@ -37,6 +37,7 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     lines = [f"# {plan.job.inputs.source}", "", f"The map and the report, in a browser: `{shown}`", ""]
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
     lost = [*summary.footage_lost, *(line for stage in summary.stages for line in stage.failures)]
+    lines += ["", *(f"- warning: {line}" for stage in summary.stages for line in stage.warnings)]
     lines += ["", f"{len(summary.frames_lost)} frames lost.", "", *(f"- {line}" for line in lost), ""]
     for name in ("direction", "speed"):
         image = plan.layout.maps / f"{name}_preview.png"
@@ -44,13 +45,8 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
             data = base64.b64encode(image.read_bytes()).decode()
             lines += [f"## {name.capitalize()}", f"![modal {name}](data:image/png;base64,{data})", ""]
     create_markdown_artifact(key="summary", markdown="\n".join(lines), description="Summary and maps")
-    if not is_remote(plan.layout.root):
-        create_link_artifact(
-            key="report",
-            link=page_address(report),
-            link_text="report",
-            description="The run's own page: map and report",
-        )
+    if (link := page_address(report)) is not None:
+        create_link_artifact(key="report", link=link, link_text="report", description="The run's page: map and report")
     create_table_artifact(
         key="stages",
         table=[
@@ -67,13 +63,12 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     )
 
 
-def page_address(report: Path) -> str:
-    """Address of the page under `velfield serve`; else of the file, which browsers open only by hand, or of the
-    object on S3."""
+def page_address(report: Path) -> str | None:
+    """Address of the page under `velfield serve`; None elsewhere: a browser opens no link to a file or an object."""
     served = os.environ.get(PAGES_OF)
     if served is not None and not is_remote(report) and report.resolve().is_relative_to(Path(served).resolve()):
         return f"{os.environ[PAGES]}/{report.resolve().relative_to(Path(served).resolve()).as_posix()}"
-    return report.as_uri()
+    return None
 
 
 class LongStage:

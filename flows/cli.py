@@ -137,7 +137,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
     except (StoreError, OSError) as error:  # a damaged run; a disk that is full, read-only or gone
-        print(f"velfield: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"velfield: {' '.join(_explain(error).split())}", file=sys.stderr)
         status = BAD_INPUT
     except KeyboardInterrupt:
         leave(STOPPED)
@@ -147,6 +147,13 @@ def main() -> None:
         print(f"velfield: S3: {_explain_s3(error)}", file=sys.stderr)
         status = BAD_INPUT
     sys.exit(status)
+
+
+def _explain(error: Exception) -> str:
+    """What a disk refused, by the name of the file alone."""
+    if not isinstance(error, OSError) or error.filename is None:
+        return str(error)
+    return f"{error.filename}: {error.strerror}; expected a place that is there, has room, and can be read and written"
 
 
 if __name__ == "__main__":

@@ -44,7 +44,8 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
     for line in summary.frames_lost:
         get_run_logger().warning(line)
     lost = f", {len(summary.frames_lost)} frames lost" if summary.frames_lost else ""
-    print_with_time(f"{Path(source).name} is done{lost}: {page_address(RunLayout(Path(summary.root)).report)}")
+    report = RunLayout(Path(summary.root)).report
+    print_with_time(f"{Path(source).name} is done{lost}: {page_address(report) or report.as_uri()}")
     return summary.root
 
 

@@ -75,6 +75,8 @@ class AnalysisRecord(Model):
 
     version: PositiveInt = ANALYSIS_VERSION
     code_version: str
+    about: str = ""
+    """What was analysed, when it was filmed, and its scale, for people."""
     gsd_m: PositiveFloat
     gsd_known: bool
     """False: lengths are by the paper's ground sample distance."""

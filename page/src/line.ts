@@ -6,6 +6,7 @@ import type { Point } from "./coordinates";
 import type { Run } from "./run";
 import { percentile, roundUp, ticks, type Units } from "./units";
 
+const SURE_SPEEDS = 19; // fewer do not bound an 85th percentile
 const PLOT = { width: 280, height: 112, left: 10, bottom: 34, top: 6 };
 
 export function showLine(crossings: Crossing[], [start, end]: [Point, Point], run: Run, units: Units): HTMLElement {
@@ -57,7 +58,9 @@ function oneWay(
     ["Median speed", speed(50)],
     ["85th percentile", speed(85)],
   ];
-  return [title, pairs(rows), bars(speeds.map((value) => value * units.perPxPerS), top, units.speed)];
+  const seen = part.length === 1 ? "One vehicle" : `${part.length} vehicles`;
+  const caution = make("p", { class: "note" }, `${seen} only: the percentiles are uncertain.`);
+  return [title, pairs(rows), ...(part.length < SURE_SPEEDS ? [caution] : []), bars(speeds.map((value) => value * units.perPxPerS), top, units.speed)];
 }
 
 /** A histogram of speeds, as SVG. */

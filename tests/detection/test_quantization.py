@@ -112,7 +112,7 @@ def test_a_processor_that_saturates_takes_floating_point_and_says_so(monkeypatch
         monkeypatch.setattr(f"velfield.detection.cnn.{module}.is_exact", lambda: False)
     monkeypatch.setattr(runtime, "_limitations_reported", False)
     detector = shipped().for_flight([cars(1)], CnnConfig())
-    assert detector.limitations == [INEXACT]
+    assert (detector.notes, detector.limitations) == ([INEXACT], [])
     with pytest.warns(RuntimeWarning, match="VNNI"):
         found, _ = detector.predictor(cars()[None])
     np.testing.assert_array_equal(found, shipped().predictor(cars()[None])[0])

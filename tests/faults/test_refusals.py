@@ -71,17 +71,24 @@ def test_a_command_that_cannot_be_is_one_line(
 
 
 @pytest.mark.parametrize(
-    "error", [PermissionError(13, "Permission denied", "/x"), OSError(30, "Read-only file system")]
+    ("error", "said"),
+    [
+        (
+            PermissionError(13, "Permission denied", "/x"),
+            "/x: Permission denied; expected a place that is there, has room, and can be read and written",
+        ),
+        (OSError(30, "Read-only file system"), "[Errno 30] Read-only file system"),
+    ],
 )
 def test_a_disk_that_refuses_is_one_line(
-    error: OSError, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: OSError, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(cli, "app", refuse)
     status, lines = command(monkeypatch, capsys, "schema")
-    assert (status, lines) == (1, [f"velfield: {error}"])
+    assert (status, lines) == (1, [f"velfield: {said}"])
 
 
 def test_an_object_store_that_does_not_answer_is_one_line() -> None:

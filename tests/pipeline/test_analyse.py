@@ -90,7 +90,7 @@ def test_a_short_clip_is_said_to_be_short(tmp_path: Path, capsys: pytest.Capture
     analyse(tracks=tmp_path / "t.csv", out=tmp_path / "out")
     text = capsys.readouterr().out
     assert "4 moving vehicles in 6 s are too few" in text
-    assert re.search(r"u-turns +none in 6 s, too short to say how rare they are", text)
+    assert re.search(r"u-turns +none was seen in 6 s, too short a time to say how rare they are", text)
     assert "an hour" not in text
     tables = AnalysisRecord.model_validate_json((tmp_path / "out" / "analysis.json").read_text()).tables
     assert next(t for t in tables if t.name == "signals").note.startswith("Too little data: 4 moving vehicles in 6 s.")

@@ -82,6 +82,15 @@ def test_a_link_out_of_the_run_folder_is_refused_and_not_written_through(
     assert not elsewhere.is_file() or elsewhere.read_text() == "of somebody"
 
 
+def test_a_file_where_the_run_is_to_be_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "there").write_text("a file")
+    with (
+        pytest.raises(InputError, match=r"there: found that no folder can be made .* give another --out"),
+        locked(RunLayout(tmp_path / "there")),
+    ):
+        pass
+
+
 def test_links_within_the_run_folder_and_one_to_it_are_followed(tmp_path: Path) -> None:
     (tmp_path / "disk" / "a").mkdir(parents=True)
     (tmp_path / "disk" / "b").symlink_to("a")

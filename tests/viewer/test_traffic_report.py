@@ -32,13 +32,13 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
 def test_a_short_clip_is_answered_by_what_is_missing() -> None:
     east = np.array([[0.0, 10.0], [100.0, 10.0]])
     short = TrafficAnalysis(gather([drive(east, 2.0 * k) for k in range(3)]))
-    page = first_page(short)
+    page, seconds = first_page(short), duration_text(short.trajectories.duration_s)
     assert any("too few" in line for line in page.withheld)
     assert [lines for _, lines in page.answers[1:]] == [
         ("Not known: no junction of lanes was found.",),
         ("Not known: no junction of lanes was found.",),
         ("Not known: no road with 8 vehicles that go freely and steadily.",),
-        (f"Not known: none in {duration_text(short.trajectories.duration_s)}, too short to say how rare they are.",),
+        (f"Not known: none was seen in {seconds}, too short a time to say how rare they are.",),
     ]
     assert {d.name for d in traffic_diagrams(short, None)} <= {"place", "speed-profile"}
 

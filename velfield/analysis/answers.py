@@ -13,7 +13,7 @@ from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS = 60.0, 30
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
-_TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
+TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
     yield from _speeds(analysis, unit)
     for number, signal in analysis.signals.items():
         if analysis.junction_kind(number) == "crossing":
-            yield Answer("signal", f"crossing {number}", "too little data", _TWO_LEVELS)
+            yield Answer("signal", f"crossing {number}", "too little data", TWO_LEVELS)
         else:
             yield _signal(number, signal)
     seconds = analysis.trajectories.duration_s
@@ -121,7 +121,7 @@ def _classes(analysis: TrafficAnalysis) -> Answer:
 
 
 def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
-    found = [m for j in analysis.movements for m in j.movements]
+    found = [m for j in analysis.movements if len(j.movements) > 1 for m in j.movements]  # else there is no choice
     for m in sorted(found, key=lambda m: -(m.seen + m.inferred)):
         share = f", {estimate_text(m.share, '%', 100)} of those from {m.arm_in}" if m.share else ""
         delay = f", delay {estimate_text(m.delay_s, 's')}" if m.delay_s else ""
@@ -132,6 +132,8 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
 
 def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
     for r in analysis.scene.relations if analysis.scene else ():
+        if not r.seen:
+            continue  # the table has what is inferred alone
         share = f", {estimate_text(r.share, '%', 100)} of those from {r.origin.name}" if r.share else ""
         text = f"{count_text(round(r.vehicles), 'vehicle')}, {r.seen} of them tracked all the way{share}"
         yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
@@ -147,6 +149,10 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
     if not known:
         text = "too little data: no road with 8 vehicles that go freely and steadily"
         yield Answer("speed", "", "too little data", text)
+    means = [(flow.lane, mean) for flow in analysis.flows if (mean := flow.space_mean_speed_m_per_s)]
+    for lane, mean in sorted(means, key=lambda pair: -pair[1].n):
+        text = f"mean {estimate_text(mean, unit, PER_M_PER_S[unit])}, stops and queues included"
+        yield Answer("mean speed", f"lane {lane}", "found", text, mean.in_units(PER_M_PER_S[unit]), unit)
 
 
 def _signal(number: int, signal: JunctionSignal) -> Answer:
@@ -197,7 +203,7 @@ def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
         text = f"{n}{often}: {detail}" if detail else f"{n}{often}"
         return Answer(topic, "", "found", text, rate, "/h" if rate else "")
     if seconds < _SHORT_S:
-        text = f"none in {duration_text(seconds)}, too short to say how rare they are"
+        text = f"none was seen in {duration_text(seconds)}, too short a time to say how rare they are"
         return Answer(topic, "", "too little data", text)
     hourly = estimate_event_rate(0, seconds / 3600).high
     fewer = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"

@@ -214,7 +214,7 @@ class Detector(ABC):
 
     @property
     def notes(self) -> list[str]:
-        """Assumptions made about the detector's file, one line each."""
+        """Assumptions made about the detector's file, and what takes longer on this machine; one line each."""
         return []
 
     @property

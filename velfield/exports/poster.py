@@ -95,5 +95,4 @@ def _date(run: Run, options: ExportOptions) -> str:
         return f"{options.start:%Y-%m-%d %H:%M %Z}"
     if run.start is None:
         return "date not recorded (give --start)"
-    clock = "UTC" if run.start.is_utc else "by the camera's clock"
-    return f"{run.start.time:%Y-%m-%d %H:%M} {clock}"
+    return run.start.text()

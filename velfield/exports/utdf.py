@@ -57,7 +57,10 @@ def utdf(analysis: TrafficAnalysis, *, height_m: float) -> str:
         if analysis.junction_kind(found.junction.number) in ("intersection", "roundabout") and found.movements
     ]
     if not nodes:
-        raise InputError("no junction with movements was found, so there are no volumes")
+        raise InputError(
+            "found no intersection or roundabout at which turns were seen, expected one: Synchro has volumes of no "
+            "other junction; --format turning_counts has merges too"
+        )
     columns = list(dict.fromkeys(name for node in nodes for name in node.lane_columns))
     sections: list[tuple[str, str, list[str], Rows]] = [
         ("Network", "Network Settings", ["RECORDNAME", "DATA"], iter([["UTDFVERSION", 8], ["Metric", 1]])),

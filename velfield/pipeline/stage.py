@@ -153,7 +153,7 @@ STAGES: tuple[Stage, ...] = (
         version=10,
         label="lens",
         lines=(
-            Line("no significant distortion; pinhole model used", lambda counts: not counts.get("corner_px")),
+            Line("no distortion was established; pinhole model used", lambda counts: not counts.get("corner_px")),
             Line(
                 "distortion of {corner_px:.1f} px at the corners, straight lines to {residual_px:.2f} px",
                 lambda counts: "residual_px" in counts,

@@ -204,7 +204,7 @@ def record_analysis(layout: RunLayout, keys: Mapping[str, str], *, slice_s: floa
 
 def _analysed(keys: Mapping[str, str]) -> str:
     """The key of what an analysis reads: the tracks, and their scale, which a run of given tracks has no stage for."""
-    return keys.get("scale") or keys["tracks"]
+    return keys.get("scale") or keys.get("tracks", "")
 
 
 def remove_analysis(layout: RunLayout, *, unless: Mapping[str, str] | None = None) -> list[str]:

@@ -47,14 +47,18 @@ def locked(layout: RunLayout, lost: Lost = _interrupt) -> Iterator[None]:
     Raises
     ------
     InputError
-        Another process holds it: with its pid, host and since when. A symbolic link leads out of the folder. Or, on
-        S3, the lock was lost.
+        Another process holds it: with its pid, host and since when. There can be no such folder. A symbolic link leads
+        out of it. Or, on S3, the lock was lost.
     """
     if is_remote(layout.lock):
         with _leased(layout.lock, str(layout.root), lost):
             yield
         return
-    layout.root.mkdir(parents=True, exist_ok=True)
+    try:
+        layout.root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        found = f"found that no folder can be made there ({error.strerror})"
+        raise InputError(f"{layout.root}: {found}, expected one or a place for it; give another --out") from None
     _refuse_links(layout.root)
     while True:
         with layout.lock.open("a+") as file:

@@ -53,9 +53,14 @@ class CnnDetector(Detector):
 
     @property
     def limitations(self) -> list[str]:
-        """A GPU that does not start; a processor without exact sums of products of 8 bits."""
+        """A GPU that does not start."""
+        return device_limitations(current_device())
+
+    @property
+    def notes(self) -> list[str]:
+        """That this processor has no exact sums of products of 8 bits: results are right, and take longer."""
         wanted = self.record.activation_ranges is not None and not uses_cuda(current_device())
-        return device_limitations(current_device()) + ([INEXACT] if wanted and not is_exact() else [])
+        return [INEXACT] if wanted and not is_exact() else []
 
     @property
     def weak_margin(self) -> float:

@@ -27,6 +27,7 @@ from velfield.report.traffic.first_page import first_page
 from velfield.report.traffic.report import report_html, report_pdf
 from velfield.run.commits import code_version, read_commits, record_analysis, write_atomically
 from velfield.run.flight_record import read_flight_record
+from velfield.run.frame_transforms import read_georeference
 from velfield.run.layout import RunLayout, remove_tree, to_path
 from velfield.run.lock import locked
 from velfield.run.run import Run, open_run
@@ -60,12 +61,21 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
             replace(run.analysis.traffic, slice_s=slice_s),
             run.layout.analysis,
             Georeference.from_grid(run.grid),
+            about=_about(run),
             gsd_known=run.grid.gsd_m is not None,
             picture=run.base_image,
             frames=_frames(run),
             speed_unit=speed_unit,
         )
         record_analysis(run.layout, run.record.keys, slice_s=slice_s)
+
+
+def _about(run: Run) -> str:
+    """The source, when it was filmed, and the scale with its interval."""
+    given, place = run.record.given, read_georeference(run.layout)
+    scale = place.scale.used if place else None
+    name = Path(given.source).name if given else run.layout.root.name
+    return ", ".join([name, *([run.start.text()] if run.start else []), *([scale.text()] if scale else [])])
 
 
 def _frames(run: Run) -> Frames | None:
@@ -125,6 +135,7 @@ def analyse_tracks(
         TrafficAnalysis(tracks, slice_s),
         to_path(out),
         georeference,
+        about=path.name,
         gsd_known=True,
         picture=None,
         speed_unit=speed_unit,
@@ -141,6 +152,7 @@ def write_analysis(
     out: Path,
     georeference: Georeference,
     *,
+    about: str,
     gsd_known: bool,
     picture: GreyImage | None,
     frames: Frames | None = None,
@@ -159,6 +171,7 @@ def write_analysis(
     page = first_page(analysis, unit=speed_unit)
     record = AnalysisRecord(
         code_version=code_version(),
+        about=about,
         gsd_m=gsd_m,
         gsd_known=gsd_known,
         duration_s=round(analysis.trajectories.duration_s, 3),

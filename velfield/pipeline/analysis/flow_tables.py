@@ -7,14 +7,13 @@ import numpy as np
 
 from schemas.analysis import AnalysisTable, GeometryRecord
 from velfield.analysis.flow.volume import flow_slices
+from velfield.analysis.intervals import MIN_VEHICLES
 from velfield.analysis.lanes.model import Lane
 from velfield.analysis.signals.coordination import Offset, QueueGrowth, find_offsets, queue_growth
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.cells import KM_PER_H, Column, estimates, line_geometry, make_table, point_geometry
 
 _SLICE_S, _MAX_SLICES = 60.0, 60
-_MIN_VEHICLES = 3
-"""A slice with fewer vehicles is no point of the diagram."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
     ]
     slice_s = max(_SLICE_S, analysis.trajectories.duration_s / _MAX_SLICES)
     note = (
-        f"Edie's definitions over each lane and slices of about {slice_s:.0f} s with {_MIN_VEHICLES} vehicles or more; "
+        f"Edie's definitions over each lane and slices of about {slice_s:.0f} s with {MIN_VEHICLES} vehicles or more; "
         "a row is a point of the lane's diagram."
     )
     return make_table(
@@ -51,6 +50,8 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
 
 def _slices(analysis: TrafficAnalysis, slice_s: float) -> Iterator[_Slice]:
+    if analysis.trajectories.duration_s < slice_s:
+        return
     for lane in analysis.lanes:
         found = flow_slices(analysis.lane_traffic, lane.number, analysis.trajectories.observed_s, slice_s=slice_s)
         samples = analysis.lane_traffic.samples(lane.number)
@@ -59,7 +60,7 @@ def _slices(analysis: TrafficAnalysis, slice_s: float) -> Iterator[_Slice]:
         vehicles = np.bincount(pairs[:, 0], minlength=len(found.slices))
         values = found.slices.begin_s, vehicles, found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s
         # on a lane of a metre or two vehicles have one sample each, and no speed
-        for k in np.flatnonzero((vehicles >= _MIN_VEHICLES) & np.isfinite(found.speed_m_per_s)):
+        for k in np.flatnonzero((vehicles >= MIN_VEHICLES) & np.isfinite(found.speed_m_per_s)):
             yield _Slice(lane, *(column[k].item() for column in values))
 
 

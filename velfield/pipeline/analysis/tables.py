@@ -7,6 +7,7 @@ import numpy as np
 from schemas.analysis import AnalysisTable, GeometryRecord
 from schemas.arrays import FloatArray
 from schemas.export import SpeedUnit
+from velfield.analysis.answers import TWO_LEVELS
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
 from velfield.analysis.flow.volume import LaneFlow, level_of_service
@@ -188,7 +189,8 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     names, junctions = {True: "yes", False: "no", None: "too little data"}, analysis.lanes.junctions
 
     def said(signal: JunctionSignal) -> str:
-        reason = signal.reason.removeprefix("too little data: ").removeprefix("no signal: ")
+        reason = TWO_LEVELS if analysis.junction_kind(signal.junction) == "crossing" else signal.reason
+        reason = reason.removeprefix("too little data: ").removeprefix("no signal: ")
         return names[signal.signalised] + (f": {reason}" if reason else "")
 
     columns: list[Column[JunctionSignal]] = [

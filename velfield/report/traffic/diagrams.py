@@ -46,7 +46,8 @@ def traffic_diagrams(
     yield Diagram(
         "place",
         "The place",
-        "Lanes with their direction of travel and their numbers; J: junctions. Text and tables use these numbers. "
+        "Lanes with their direction of travel and their numbers; J: junctions, small where lanes only merge or part; "
+        "in red, the roads by which vehicles enter and leave. Text and tables use these names. "
         "Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn.",
         partial(draw_place, analysis=analysis, picture=picture),
         4.6,
@@ -172,11 +173,31 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
             axes.text(x, y, str(lane.number), ha="center", va="center", fontsize=6.5, color="#0b4f8a", bbox=box)
     for junction in analysis.lanes.junctions:
         level = _is_junction(analysis, junction.number)
-        if level or junction.kind == "crossing":
-            box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
-            box["linestyle"] = "-" if level else "--"
-            x, y = junction.centre_m
-            axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=11, fontweight="bold", bbox=box)
+        box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
+        box["linestyle"] = "--" if junction.kind == "crossing" else "-"
+        size = 11 if level or junction.kind == "crossing" else 6.5  # small where lanes only merge or part
+        x, y = junction.centre_m
+        axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=size, fontweight="bold", bbox=box)
+    for arm in analysis.scene.arms if analysis.scene else ():
+        x, y = arm.xy_m
+        axes.text(x, y, arm.name, ha="center", va="center", fontsize=8, color="#7a1f1f", fontweight="bold")
+    _draw_scale(axes)
+
+
+def _draw_scale(axes: "Axes") -> None:
+    """A bar of a round number of metres in the lower left corner, about a fifth as long as the picture is wide."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    if not right - left > 0:
+        return
+    longest = (right - left) / 5
+    power = 10.0 ** np.floor(np.log10(longest))
+    length = power * max(step for step in (1, 2, 5) if step * power <= longest)
+    x, y = left + 0.03 * (right - left), bottom + 0.04 * (top - bottom)
+    axes.plot([x, x + length], [y, y], color="#1b1f24", linewidth=3, solid_capstyle="butt")
+    box = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
+    axes.text(
+        x + length / 2, y + 0.02 * (top - bottom), f"{length:g} m", ha="center", va="bottom", fontsize=7, bbox=box
+    )
 
 
 def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:

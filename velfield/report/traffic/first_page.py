@@ -52,7 +52,11 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
         ("Is there a signal?", found.get("signal", []), reasons.get("signal", no_junction)),
-        ("How fast do vehicles drive?", found.get("speed", []), reasons.get("speed", "no lane was found")),
+        (
+            "How fast do vehicles drive?",
+            found.get("speed", []) or found.get("mean speed", []),
+            reasons.get("speed", "no lane was found"),
+        ),
         ("Where is it dangerous?", events, reasons.get("conflicts", "no lane was found")),
     )
     n = len(analysis.trajectories)

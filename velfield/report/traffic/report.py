@@ -71,7 +71,7 @@ def _seen(record: AnalysisRecord, page: FirstPage) -> str:
         else f" The size of a pixel is not known: lengths and speeds are those of {PAPER_GSD_M} m, the paper's; give "
         "it by --gsd-m."
     )
-    return f"{page.seen}.{known}"
+    return f"{record.about}. {page.seen}.{known} velfield {record.code_version}."
 
 
 def _picture(diagram: Diagram) -> str:
