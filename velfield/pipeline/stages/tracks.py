@@ -9,7 +9,7 @@ from threading import Lock
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.arrays import IntArray, Mask
 from schemas.flight import assumed_gsd_m
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.detection.registry import load_detector
@@ -42,7 +42,8 @@ from velfield.tracking.doubtful import find_doubtful, find_lone
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
-from velfield.tracking.recovery import Candidates, Recovered, interpolate_gap, recover_tracks
+from velfield.tracking.positions import IDS, TrackFrames, Triples, all_positions, find_triples, keep_surest
+from velfield.tracking.recovery import Candidates, recover_tracks
 from velfield.tracking.strips import (
     StripSums,
     along_headings,
@@ -52,14 +53,9 @@ from velfield.tracking.strips import (
     measure_tracks,
 )
 
-_Columns = dict[str, np.ndarray]
-"""Columns of positions, (n,) each, by name."""
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
-_IDS = [f"detection_id_{k}" for k in range(3)]
 _BORDER_M, _BORDER_S = 5.0, 0.6
 """A vehicle that would be outside the frame after so many metres and seconds has left it."""
-_MISSED_S = 1.0
-"""A track that misses frames for so long goes on linearly meanwhile."""
 _CONFIDENCE = 0.95
 """Confidence of a tracklet that only its track confirms: at least this fraction was right in simulated flights."""
 _HIDDEN_S = 1.5
@@ -71,21 +67,21 @@ _AT_ONCE = 4
 def chain_tracks(plan: Plan) -> StageResult:
     """Give every tracklet the track that it belongs to: reads a few columns of all units, writes unit by unit."""
     sources, layout = tracklet_files(plan), plan.layout
-    tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*_IDS, *_MIDDLE, *END_COLUMNS])
-    ids, chain = np.unique(assign_tracks(tracklets[_IDS].to_numpy(np.int64)), return_inverse=True)
+    tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*IDS, *_MIDDLE, *END_COLUMNS])
+    ids, chain = np.unique(assign_tracks(tracklets[IDS].to_numpy(np.int64)), return_inverse=True)
     strips = sum_strips(plan, tracklets.assign(track_id=ids[chain]))
     gsd_m = assumed_gsd_m(read_tracking_gsd(layout))
     starts, ends = find_ends(tracklets, chain, len(ids), gsd_m)
     candidates = read_candidates(plan, tracklets, gsd_m)
     context = find_context(plan, ends, starts, strips)
     found = recover_tracks(ids, ends, starts, _gap_limits(plan), context, candidates)
-    flight = _Frames(open_frames(layout.frames).column("time_s"), linkable_frames(plan))
+    flight = TrackFrames(open_frames(layout.frames).column("time_s"), linkable_frames(plan))
     positions = all_positions(tracklets.assign(track_id=found.tracks[chain]), found, candidates, gsd_m, flight)
     first_frame = np.array(tracklets["frame_0"])
     del tracklets, candidates, context  # what follows needs no more of them, and they are large
     whole = find_split_tracks(positions, gsd_m)
     if len(whole):
-        positions = _keep_surest(_join_parts(positions, whole))
+        positions = keep_surest(_join_parts(positions, whole))
         found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
@@ -150,7 +146,7 @@ def _without(table: pd.DataFrame, doubles: IntArray) -> pd.DataFrame:
 def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candidates:
     """Detections in no tracklet, and weak candidates, of the whole flight."""
     names = ["detection_id", "frame", "time_s", "x_px", "y_px", "orientation_rad"]
-    used = np.unique(tracklets[_IDS].to_numpy(np.int64))
+    used = np.unique(tracklets[IDS].to_numpy(np.int64))
 
     def read(path: Path) -> pd.DataFrame:
         table = read_tables([path], DETECTION_COLUMNS, only=names)
@@ -197,130 +193,8 @@ def _detection_files(plan: Plan) -> list[Path]:
     return [path for path in paths if path.exists()]
 
 
-@dataclass(frozen=True)
-class _Frames:
-    """Times (frames,) and which are usable."""
-
-    times_s: FloatArray
-    usable: Mask
-
-
-def all_positions(
-    tracklets: pd.DataFrame, found: Recovered, candidates: Candidates, metres: float, frames: _Frames
-) -> pd.DataFrame:
-    """Positions of every track (`TRACK_POSITION_COLUMNS`) by frame and track: seen, confirmed and interpolated."""
-    ids = np.concatenate([tracklets[name].to_numpy() for name in _IDS])
-    first = np.sort(np.unique(ids, return_index=True)[1])  # of each detection
-    found_in = first % max(len(tracklets), 1)
-    xy = candidates.position_m[found.candidate] / metres
-    confirmed = {
-        "track_id": found.track_id,
-        "frame": candidates.frame[found.candidate],
-        "time_s": candidates.time_s[found.candidate],
-        "x_px": xy[:, 0],
-        "y_px": xy[:, 1],
-        "detection_id": candidates.detection_id[found.candidate],
-    }
-    known = {"track_id": tracklets["track_id"].to_numpy()[found_in], "detection_id": ids[first]}
-    for name, of_detection in (
-        ("frame", "frame_{}"),
-        ("time_s", "time_{}_s"),
-        ("x_px", "x_{}_px"),
-        ("y_px", "y_{}_px"),
-    ):
-        known[name] = np.concatenate([tracklets[of_detection.format(k)].to_numpy() for k in range(3)])[first]
-    known = {name: np.concatenate([known[name], values]) for name, values in confirmed.items()}
-    known["source"] = np.repeat([0, 1], [len(first), len(xy)])
-    numbers, times_s = np.flatnonzero(frames.usable), frames.times_s
-    inferred = [_between_frames(known, numbers, times_s), _across_gaps(found, candidates, metres, numbers, times_s)]
-    parts = [known]
-    for one in inferred:
-        parts.append({**one, "detection_id": np.full_like(one["frame"], -1), "source": np.full_like(one["frame"], 2)})
-
-    def column(name: str) -> np.ndarray:
-        return np.concatenate([part[name] for part in parts])
-
-    rows = _surest(column("frame"), column("track_id"), column("source"))
-    return pd.DataFrame({name: column(name)[rows] for name in known}, copy=False)
-
-
-def _surest(frame: IntArray, track: IntArray, source: IntArray) -> IntArray:
-    """Row of the most certain position of each track in each frame, sorted by frame and track."""
-    order = np.lexsort((source, track, frame))
-    frame, track = frame[order], track[order]
-    changes = (np.diff(frame) != 0) | (np.diff(track) != 0)
-    return np.asarray(order[np.r_[True, changes][: len(order)]])
-
-
-def _keep_surest(positions: pd.DataFrame) -> pd.DataFrame:
-    """The rows of `_surest`."""
-    rows = _surest(*(positions[name].to_numpy() for name in ("frame", "track_id", "source")))
-    return positions.iloc[rows].reset_index(drop=True)
-
-
-def _between_frames(known: _Columns, frames: IntArray, times_s: FloatArray) -> _Columns:
-    """Frames that a track misses for a moment, linearly in time."""
-    order = np.lexsort((known["frame"], known["track_id"]))
-    track, time_s = known["track_id"][order], known["time_s"][order]
-    rank = np.searchsorted(frames, known["frame"][order])
-    same = np.diff(track) == 0
-    missed = np.where(same & (np.diff(time_s) <= _MISSED_S), np.maximum(np.diff(rank) - 1, 0), 0)
-    row = np.repeat(np.arange(len(missed)), missed)
-    step = np.arange(len(row)) - np.repeat(np.cumsum(missed) - missed, missed) + 1
-    frame = frames[rank[row] + step] if len(row) else np.empty(0, np.int64)
-    part = (times_s[frame] - time_s[row]) / (time_s[row + 1] - time_s[row])
-    before, after = order[row], order[row + 1]
-    xy = {one: known[one][before] + part * (known[one][after] - known[one][before]) for one in ("x_px", "y_px")}
-    return {"track_id": track[row], "frame": frame, "time_s": times_s[frame], **xy}
-
-
-def _across_gaps(
-    found: Recovered, candidates: Candidates, metres: float, frames: IntArray, times_s: FloatArray
-) -> _Columns:
-    """Frames within the gaps that were closed, on the way across them."""
-    usable_s = times_s[frames]  # ascending
-    tracks, inside, places = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty((0, 2))]
-    for gap in found.gaps:
-        here = frames[slice(*(np.searchsorted(usable_s, gap.time_s[k], side=("right", "left")[k]) for k in (0, 1)))]
-        if len(here):
-            tracks.append(np.full(len(here), gap.track_id))
-            inside.append(here)
-            places.append(interpolate_gap(gap, candidates, times_s[here]) / metres)
-    frame, xy = np.concatenate(inside), np.concatenate(places)
-    columns = {"track_id": np.concatenate(tracks), "frame": frame, "time_s": times_s[frame]}
-    return {**columns, "x_px": xy[:, 0], "y_px": xy[:, 1]}
-
-
-@dataclass(frozen=True)
-class _Triples:
-    """Detections of a track in three usable frames in a row of which only the track confirmed one, by track and frame.
-
-    ``track_id`` (n,), ``frame`` (n,) of the first, ``ids`` (n, 3) of the detections.
-    """
-
-    track_id: IntArray
-    frame: IntArray
-    ids: IntArray
-
-    def take(self, rows: IntArray) -> "_Triples":
-        return _Triples(self.track_id[rows], self.frame[rows], self.ids[rows])
-
-
-def find_triples(positions: pd.DataFrame, frames: _Frames, max_interval_s: float) -> _Triples:
-    """Candidate tracklets that contain a detection confirmed by its track only, from `TRACK_POSITION_COLUMNS`."""
-    known = positions[positions["source"] < 2].sort_values(["track_id", "frame"], ignore_index=True)
-    track, frame = known["track_id"].to_numpy(), known["frame"].to_numpy()
-    near = (np.diff(track) == 0) & (np.diff(np.cumsum(frames.usable)[frame]) == 1)
-    near &= np.diff(known["time_s"].to_numpy()) <= max_interval_s
-    confirmed = known["source"].to_numpy() == 1
-    first = np.flatnonzero(near[:-1] & near[1:]) if len(near) > 1 else np.empty(0, np.int64)
-    first = first[(confirmed[first] | confirmed[first + 1] | confirmed[first + 2])]
-    ids = known["detection_id"].to_numpy()
-    return _Triples(track[first], frame[first], np.stack([ids[first + k] for k in range(3)], axis=1))
-
-
 def recovered_tracklets(
-    plan: Plan, frames: range, triples: _Triples, flight: _Frames, units: Mapping[int, UnitDetections]
+    plan: Plan, frames: range, triples: Triples, flight: TrackFrames, units: Mapping[int, UnitDetections]
 ) -> pd.DataFrame:
     """Tracklets (`TRACKLET_COLUMNS`) of the triples of a unit's frames that pass the gates; ``units``, what is read of
     the units that `_window` needs, with the triples' detections."""
@@ -345,7 +219,7 @@ def recovered_tracklets(
     return made.assign(track_id=track.reindex(made["tracklet_id"]).to_numpy())
 
 
-def _window(plan: Plan, frames: range, flight: _Frames) -> range:
+def _window(plan: Plan, frames: range, flight: TrackFrames) -> range:
     """Frames that the triples of a unit reach."""
     return window_frames(list(flight.usable), list(flight.times_s), frames, plan.config.tracking.max_interval_s)
 
@@ -364,8 +238,8 @@ class _Output:
     track: IntArray
     positions: pd.DataFrame
     apart: pd.DataFrame
-    flight: _Frames
-    triples: _Triples
+    flight: TrackFrames
+    triples: Triples
     ids: IntArray
     doubles: IntArray
     sure_scores: pd.Series | None
