@@ -50,6 +50,7 @@ env: page  ## the environment, with the viewer's page
 # uv installs the locked environment in seconds where pip takes two minutes; pip brings uv, and does its work where uv
 # cannot: where only a certificate authority that uv does not read is trusted, say.
 $(STAMP): requirements.lock pyproject.toml
+	@echo "make: the environment first; half a minute, or two on a slow machine"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@{ $(PIP) install --quiet "uv>=0.8" && $(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock; } \
 	  || { echo "make: uv could not install the packages; pip installs them, in about two minutes"; \

@@ -6,6 +6,7 @@ import sys
 import urllib.error
 import urllib.request
 from contextlib import suppress
+from http import HTTPStatus
 from http.client import HTTPException
 from pathlib import Path
 
@@ -69,16 +70,21 @@ def check_address() -> None:
     if not url:
         return
     try:
-        with urllib.request.urlopen(f"{url}/health", timeout=_ANSWER_S):
-            return
-    except urllib.error.HTTPError:
-        return
+        with urllib.request.urlopen(f"{url}/health", timeout=_ANSWER_S) as answer:
+            is_page = answer.headers.get_content_type() == "text/html"
+    except urllib.error.HTTPError as error:
+        is_page = error.code == HTTPStatus.NOT_FOUND
     except urllib.error.URLError as error:
         if isinstance(error.reason, ssl.SSLError):
             return  # Prefect has certificates of its own
         raise _no_answer(url, error.reason) from None
     except (OSError, ValueError, HTTPException) as error:  # no time left; no address; no HTTP
         raise _no_answer(url, error) from None
+    if is_page:
+        raise InputError(
+            f"PREFECT_API_URL {url}: found a server, and not Prefect's interface there, whose address ends with /api; "
+            "correct it"
+        )
 
 
 def _no_answer(url: str, error: object) -> InputError:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from flows import launch, prefect_server
+from tests.browser import served
 from velfield.errors import CacheWarning, DeviceWarning, InputError
 
 
@@ -86,6 +87,15 @@ def test_an_address_without_a_server_is_one_line_within_seconds(url: str, monkey
             prefect_server.check_address()
     assert "\n" not in str(caught.value)
     assert "(`unset PREFECT_API_URL`)" in str(caught.value)
+
+
+def test_an_address_of_another_server_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As that of Prefect's pages is, where ``/api`` is left out."""
+    launch.spare_proxies()
+    with served(tmp_path) as address:
+        monkeypatch.setenv("PREFECT_API_URL", address)
+        with pytest.raises(InputError, match=r"not Prefect's interface there, whose address ends with /api"):
+            prefect_server.check_address()
 
 
 def test_a_server_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

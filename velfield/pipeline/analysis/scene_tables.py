@@ -48,8 +48,14 @@ def matrix_table(analysis: TrafficAnalysis) -> AnalysisTable:
         number = to.number
         return Column(f"to_{to.name}", f"To {to.name}", "", lambda arm: vehicles.get((arm.number, number), 0.0), 1)
 
+    def entered(arm: Arm) -> int:
+        return int((trips.origin == arm.number).sum())
+
+    def unknown(arm: Arm) -> float:
+        return max(entered(arm) - sum(vehicles.get((arm.number, to.number), 0.0) for to in exits), 0.0)
+
     columns += map(column, exits)
-    columns.append(Column("all", "All", "", lambda arm: int((trips.origin == arm.number).sum())))
+    columns += [Column("unknown", "Not known where", "", unknown, 1), Column("all", "All", "", entered)]
     return make_table("origins", "Movements", title, _note(scene), columns, entries, place)
 
 
