@@ -1,6 +1,7 @@
 """The ``velfield`` command. Imports nothing heavy until a command runs."""
 
 import atexit
+import errno
 import gc
 import os
 import sys
@@ -149,9 +150,12 @@ def main() -> None:
     sys.exit(status)
 
 
+_REFUSALS = (errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.ENOTDIR)
+
+
 def _explain(error: Exception) -> str:
     """What a disk refused, by the name of the file alone."""
-    if not isinstance(error, OSError) or error.filename is None:
+    if not isinstance(error, OSError) or error.filename is None or error.errno not in _REFUSALS:
         return str(error)
     return f"{error.filename}: {error.strerror}; expected a place that is there, has room, and can be read and written"
 

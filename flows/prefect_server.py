@@ -73,7 +73,7 @@ def check_address() -> None:
         with urllib.request.urlopen(f"{url}/health", timeout=_ANSWER_S) as answer:
             is_page = answer.headers.get_content_type() == "text/html"
     except urllib.error.HTTPError as error:
-        is_page = error.code == HTTPStatus.NOT_FOUND
+        is_page = error.code == HTTPStatus.NOT_FOUND and error.headers.get_content_type() == "text/html"
     except urllib.error.URLError as error:
         if isinstance(error.reason, ssl.SSLError):
             return  # Prefect has certificates of its own

@@ -94,16 +94,16 @@ class FlightStart(Model):
     """Where it was read, for people."""
     is_utc: bool
 
-    def text(self) -> str:
-        """Date, time and whose clock it is by."""
-        return f"{self.time:%Y-%m-%d %H:%M} {'UTC' if self.is_utc else 'by the camera clock'}"
-
     """Whether the clock is UTC by its format; a camera's own clock mostly shows local time."""
 
     @property
     def time(self) -> datetime:
         """The clock as if it were set to UTC."""
         return datetime.fromtimestamp(self.clock_s, UTC)
+
+    def text(self) -> str:
+        """Date, time and whose clock it is by."""
+        return f"{self.time:%Y-%m-%d %H:%M} {'UTC' if self.is_utc else 'by the camera clock'}"
 
 
 class GeoreferenceRecord(Model):

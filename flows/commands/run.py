@@ -1,6 +1,7 @@
 """``velfield run``: from a video, or tracks, to the maps."""
 
 import shlex
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -257,7 +258,8 @@ def _show_plan(job: Job, runner: "RunnerConfig") -> int:
 def _clip_list(source: Path, more: tuple[Path, ...], out: Path) -> Path:
     """The list of several clips, written into the run folder."""
     from velfield.run.layout import is_remote, to_path
-    from velfield.sources.clips import CLIPS_SUFFIX, write_clip_list
+    from velfield.sources.clips import CLIPS_SUFFIX, read_clip_list, write_clip_list
+    from velfield.sources.frames import local_path
 
     if is_remote(to_path(out)):
         raise InputError(
@@ -266,6 +268,12 @@ def _clip_list(source: Path, more: tuple[Path, ...], out: Path) -> Path:
             "and run that file"
         )
     path = out / f"source{CLIPS_SUFFIX}"
+    before = set[Path]()
+    if RunLayout(out).flight.exists():
+        with suppress(InputError, FileNotFoundError):  # of one file, or of clips that are gone
+            before = set(read_clip_list(path))
+    if before and not before & {local_path(clip, "video") for clip in (source, *more)}:
+        raise InputError(f"{out} holds the run of other clips, which this would overwrite; give another --out")
     write_clip_list(path, (source, *more))
     return path
 

@@ -71,3 +71,4 @@ def test_a_detection_in_no_track_needs_a_score_above_that_of_a_tenth_of_the_trac
     in_tracks = detections[["detection_id", "frame"]].take([3])  # none in frame 9: nothing could be followed there
     lone = find_lone(detections, in_tracks, pd.Series([0.14, *[0.15] * 18]))
     assert lone["detection_id"].tolist() == [0, 1]
+    assert not len(find_lone(detections, in_tracks, pd.Series([0.15] * 9)))  # too few to tell what is usual

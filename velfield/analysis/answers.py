@@ -121,7 +121,9 @@ def _classes(analysis: TrafficAnalysis) -> Answer:
 
 
 def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
-    found = [m for j in analysis.movements if len(j.movements) > 1 for m in j.movements]  # else there is no choice
+    kinds = {j.junction.number: analysis.junction_kind(j.junction.number) for j in analysis.movements}
+    # Where lanes merge there is no choice.
+    found = [m for j in analysis.movements if kinds[j.junction.number] != "merge" for m in j.movements]
     for m in sorted(found, key=lambda m: -(m.seen + m.inferred)):
         share = f", {estimate_text(m.share, '%', 100)} of those from {m.arm_in}" if m.share else ""
         delay = f", delay {estimate_text(m.delay_s, 's')}" if m.delay_s else ""

@@ -122,7 +122,8 @@ def georeference(
             compute_stages(plan, ("field",))
         compute_stages(plan, ("maps",))
         write_report(plan, _summary(plan))
-        notes = [*_notes(before_m, fitted, changed), *remove_analysis(run.layout)]
+        exported = "files exported so far are of the place and scale before; export them again"
+        notes = [*_notes(before_m, fitted, changed), *remove_analysis(run.layout), exported]
     return Georeferenced(fitted, record, tuple(notes))
 
 

@@ -283,7 +283,7 @@ STAGES: tuple[Stage, ...] = (
             Line(
                 "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets; {doubtful:.0f} doubtful ones and "
                 "{lone:.0f} detections in no track set aside",
-                lambda counts: bool(counts.get("doubtful", 0) + counts.get("lone", 0)),
+                lambda counts: "lone" in counts and bool(counts["doubtful"] + counts["lone"]),
             ),
             Line("{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets"),
         ),

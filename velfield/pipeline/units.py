@@ -7,8 +7,6 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import Cut, Stage, resolve
 from velfield.run.commits import WHOLE, commit_path, read_commit
 
-"""Name of the one unit of a stage that is not cut."""
-
 
 @dataclass(frozen=True)
 class Unit:

@@ -195,10 +195,11 @@ def record_page(layout: RunLayout) -> None:
     _record_files(layout, PAGE, [layout.report, *view])
 
 
-def record_analysis(layout: RunLayout, keys: Mapping[str, str], *, slice_s: float) -> None:
-    """Record the files of the analysis, and with which slices of time it was made, likewise; and of which results, by
-    the content keys of the stages."""
+def record_analysis(layout: RunLayout, *, slice_s: float) -> None:
+    """Record the files of the analysis, and with which slices of time it was made, likewise; and the content key of the
+    results that were analysed, which may be older than the settings."""
     files = [path for path in layout.analysis.rglob("*") if path.is_file()]
+    keys = {record.stage: record.key for stage in ("tracks", "scale") for record in read_commits(layout, stage)}
     _record_files(layout, ANALYSIS, files, key=_analysed(keys), slice_s=slice_s)
 
 

@@ -84,3 +84,16 @@ def _parse(path: Path) -> dict[str, Any]:
             f"{path} is damaged ({' '.join(str(error).split())}), expected the record that `velfield run` wrote; the "
             "same `velfield run` command writes it again and keeps what is finished"
         ) from None
+
+
+def source_name(path: str, kind: str) -> str:
+    """The name of a video; of a folder, or of a list of clips, with its parent's: it may well be called ``frames``.
+
+    Examples
+    --------
+    >>> source_name("/flights/street.mp4", "video"), source_name("/flights/street/frames", "folder")
+    ('street.mp4', 'street/frames')
+    """
+    source = Path(path)
+    parts = [part for part in source.parts if part != source.anchor]
+    return "/".join(parts[-2:] if kind == "folder" or source.suffix == ".clips" else parts[-1:])

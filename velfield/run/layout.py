@@ -182,6 +182,7 @@ class RunLayout:
     doubtful = _Inside("tracks/doubtful")
     """Tracklets of doubtful tracks, by unit: what is probably no vehicle is in none of the other tables of tracks."""
     doubtful_positions = _Inside("tracks/doubtful/positions")
+    """Where each of them was, by unit; with track -1, detections of a low score in no track."""
     joins = _Inside("tracks/joins.parquet")
     """Joins of tracks over a gap, with their probabilities."""
     tracklets = _Inside("tracklets")

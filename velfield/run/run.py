@@ -238,7 +238,7 @@ class Run:
         ----------
         doubtful
             With the rows of doubtful tracks, whose ``doubtful`` is true: things that stand far from vehicles, with a
-            low score (`velfield.tracking.doubtful`). No other table has them.
+            low score (`velfield.tracking.doubtful`).
         """
         gsd_m, layout = self.grid.gsd_m, self.layout
         folders = [layout.tracks, layout.doubtful] if doubtful else [layout.tracks]

@@ -86,8 +86,10 @@ def find_lone(detections: pd.DataFrame, in_tracks: pd.DataFrame, track_score: pd
         ``detection_id, frame`` of the detections of tracks, in these frames. A frame without any is not judged: nothing
         could be followed through it.
     track_score
-        Mean score of the detections of each track that is not doubtful.
+        Mean score of the detections of each track that is not doubtful. Fewer than `_MIN_TRAFFIC` tell no usual score.
     """
+    if len(track_score) < _MIN_TRAFFIC:
+        return detections[:0]
     judged = detections["frame"].isin(in_tracks["frame"]) & ~detections["detection_id"].isin(in_tracks["detection_id"])
     lone: pd.DataFrame = detections[judged & (detections["score"] < track_score.quantile(_LONE_RANK))]
     return lone

@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.flow.passings import LaneTraffic
-from velfield.analysis.intervals import Estimate, estimate_mean, estimate_median, estimate_rate
+from velfield.analysis.intervals import MIN_VEHICLES, Estimate, estimate_mean, estimate_median, estimate_rate
 from velfield.analysis.lanes.model import LaneSamples
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
@@ -15,6 +15,8 @@ _FOLLOW_S = 3.0
 """A vehicle with a shorter headway follows the one before."""
 _SPREAD, _SPREAD_N = 0.25, 8
 """Speeds on a lane have this coefficient of variation before any is seen; it counts for so many vehicles."""
+_MIN_SLICE_S = 40.0
+"""A shorter slice of time is no point of a fundamental diagram."""
 LOS_SIGNAL_S = (10.0, 20.0, 35.0, 55.0, 80.0)
 """Control delay, s, up to which levels A to E reach at signals: Highway Capacity Manual, 7th edition, Exhibit 19-8."""
 LOS_YIELD_S = (10.0, 15.0, 25.0, 35.0, 50.0)
@@ -45,13 +47,21 @@ class LaneFlow:
 
 @dataclass(frozen=True)
 class FlowSlices:
-    """Edie's flow (veh/h), density (veh/km) and speed (m/s; NaN without traffic) of a lane by slice of time: points of
-    its fundamental diagram."""
+    """Edie's flow (veh/h), density (veh/km) and speed (m/s; NaN without traffic) of a lane by slice of time, with the
+    number of vehicles."""
 
     slices: ObservedSlices
     flow_veh_per_h: FloatArray
     density_veh_per_km: FloatArray
     speed_m_per_s: FloatArray
+    vehicles: IntArray
+
+    @property
+    def points(self) -> IntArray:
+        """The slices that are points of the lane's fundamental diagram: with vehicles enough, and long enough."""
+        lasts = self.slices.end_s - self.slices.begin_s >= _MIN_SLICE_S
+        # on a lane of a metre or two vehicles have one sample each, and no speed
+        return np.flatnonzero(lasts & (self.vehicles >= MIN_VEHICLES) & np.isfinite(self.speed_m_per_s))
 
 
 def lane_flow(
@@ -104,7 +114,10 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
         spent += slices.sums(at, wait / 8)
     area = length * np.maximum(slices.end_s - slices.begin_s, 1e-9)
     speed = np.divide(driven, spent, out=np.full(len(slices), np.nan), where=spent > 0)
-    return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed)
+    number = slices.number(samples.time_s)
+    pairs = np.unique(np.column_stack([number, samples.track])[number >= 0], axis=0)
+    vehicles = np.bincount(pairs[:, 0], minlength=len(slices))
+    return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed, vehicles)
 
 
 def _steps(samples: LaneSamples) -> tuple[IntArray, FloatArray, FloatArray]:

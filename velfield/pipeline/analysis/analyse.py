@@ -26,7 +26,7 @@ from velfield.report.traffic.diagrams import traffic_diagrams
 from velfield.report.traffic.first_page import first_page
 from velfield.report.traffic.report import report_html, report_pdf
 from velfield.run.commits import code_version, read_commits, record_analysis, write_atomically
-from velfield.run.flight_record import read_flight_record
+from velfield.run.flight_record import read_flight_record, source_name
 from velfield.run.frame_transforms import read_georeference
 from velfield.run.layout import RunLayout, remove_tree, to_path
 from velfield.run.lock import locked
@@ -67,14 +67,14 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
             frames=_frames(run),
             speed_unit=speed_unit,
         )
-        record_analysis(run.layout, run.record.keys, slice_s=slice_s)
+        record_analysis(run.layout, slice_s=slice_s)
 
 
 def _about(run: Run) -> str:
     """The source, when it was filmed, and the scale with its interval."""
-    given, place = run.record.given, read_georeference(run.layout)
+    source, place = run.record.inputs.source, read_georeference(run.layout)
     scale = place.scale.used if place else None
-    name = Path(given.source).name if given else run.layout.root.name
+    name = source_name(source.path, source.kind)
     return ", ".join([name, *([run.start.text()] if run.start else []), *([scale.text()] if scale else [])])
 
 

@@ -50,17 +50,16 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
 
 def _slices(analysis: TrafficAnalysis, slice_s: float) -> Iterator[_Slice]:
-    if analysis.trajectories.duration_s < slice_s:
-        return
     for lane in analysis.lanes:
         found = flow_slices(analysis.lane_traffic, lane.number, analysis.trajectories.observed_s, slice_s=slice_s)
-        samples = analysis.lane_traffic.samples(lane.number)
-        number = found.slices.number(samples.time_s)
-        pairs = np.unique(np.column_stack([number, samples.track])[number >= 0], axis=0)
-        vehicles = np.bincount(pairs[:, 0], minlength=len(found.slices))
-        values = found.slices.begin_s, vehicles, found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s
-        # on a lane of a metre or two vehicles have one sample each, and no speed
-        for k in np.flatnonzero((vehicles >= MIN_VEHICLES) & np.isfinite(found.speed_m_per_s)):
+        values = (
+            found.slices.begin_s,
+            found.vehicles,
+            found.density_veh_per_km,
+            found.flow_veh_per_h,
+            found.speed_m_per_s,
+        )
+        for k in found.points:
             yield _Slice(lane, *(column[k].item() for column in values))
 
 

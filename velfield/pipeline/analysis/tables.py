@@ -189,8 +189,9 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     names, junctions = {True: "yes", False: "no", None: "too little data"}, analysis.lanes.junctions
 
     def said(signal: JunctionSignal) -> str:
-        reason = TWO_LEVELS if analysis.junction_kind(signal.junction) == "crossing" else signal.reason
-        reason = reason.removeprefix("too little data: ").removeprefix("no signal: ")
+        if analysis.junction_kind(signal.junction) == "crossing":
+            return TWO_LEVELS
+        reason = signal.reason.removeprefix("too little data: ").removeprefix("no signal: ")
         return names[signal.signalised] + (f": {reason}" if reason else "")
 
     columns: list[Column[JunctionSignal]] = [

@@ -5,7 +5,6 @@ No stage of the table: it is made of the summary of all stages, by every run, an
 
 import datetime
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.report.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
 from velfield.run.commits import code_version, record_page, write_atomically
+from velfield.run.flight_record import source_name
 from velfield.run.frame_transforms import north_direction_rad, read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames, open_registration
@@ -69,20 +69,13 @@ def _write_page(layout: RunLayout, report: Report) -> list[str]:
     return []
 
 
-def _name(plan: Plan) -> str:
-    """The name of the video; of a folder with its parent's, for it may well be called ``frames``."""
-    source = Path(plan.job.inputs.source)
-    parts = [part for part in source.parts if part != source.anchor]
-    return "/".join(parts[-2:] if plan.info.kind == "folder" else parts[-1:])
-
-
 def make_report(plan: Plan, summary: RunSummary) -> Report:
     """The content of the report."""
     counts: dict[str, dict[str, float]] = {stage.name: {} for stage in STAGES} | {
         stage.name: stage.counts for stage in summary.stages
     }
     return Report(
-        title=f"Velocity field of {_name(plan)}",
+        title=f"Velocity field of {source_name(plan.job.inputs.source, plan.info.kind)}",
         source=plan.job.inputs.source,
         created=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         version=code_version(),

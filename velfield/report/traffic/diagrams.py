@@ -174,8 +174,9 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
     for junction in analysis.lanes.junctions:
         level = _is_junction(analysis, junction.number)
         box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
-        box["linestyle"] = "--" if junction.kind == "crossing" else "-"
-        size = 11 if level or junction.kind == "crossing" else 6.5  # small where lanes only merge or part
+        crossing = analysis.junction_kind(junction.number) == "crossing"
+        box["linestyle"] = "--" if crossing else "-"
+        size = 11 if level or crossing else 6.5  # small where lanes only merge or part
         x, y = junction.centre_m
         axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=size, fontweight="bold", bbox=box)
     for arm in analysis.scene.arms if analysis.scene else ():
@@ -338,9 +339,8 @@ def fundamental_points(analysis: TrafficAnalysis) -> FloatArray:
     rows = []
     for lane in analysis.lanes:
         found = flow_slices(analysis.lane_traffic, lane.number, analysis.trajectories.observed_s, slice_s=_SLICE_S)
-        known = np.isfinite(found.speed_m_per_s)
         columns = found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s
-        rows.append(np.column_stack([np.full(known.sum(), lane.number), *(c[known] for c in columns)]))
+        rows.append(np.column_stack([np.full(len(found.points), lane.number), *(c[found.points] for c in columns)]))
     return np.concatenate(rows) if rows else np.empty((0, 4))
 
 

@@ -102,8 +102,11 @@ def report_pdf(record: AnalysisRecord, page: FirstPage, diagrams: Sequence[Diagr
 def _front(record: AnalysisRecord, page: FirstPage, place: Diagram) -> "Figure":
     figure = new_figure(*_PAGE_IN)
     figure.text(0.08, 0.945, "Traffic analysis", fontsize=20, fontweight="bold")
-    figure.text(0.08, 0.92, _seen(record, page), fontsize=10)
-    _place(figure, place, 10.4)
+    y = 0.925 * _PAGE_IN[1]
+    for line in textwrap.wrap(_seen(record, page), 100):
+        figure.text(0.08, y / _PAGE_IN[1], line, fontsize=10, parse_math=False)
+        y -= 0.19
+    _place(figure, place, min(10.4, y + 0.1))
     y = 4.75
     for question, lines in page.sections:
         y = _write(figure, question, y, bold=True)
@@ -118,7 +121,7 @@ def _front(record: AnalysisRecord, page: FirstPage, place: Diagram) -> "Figure":
 def _write(figure: "Figure", text: str, y_in: float, *, bold: bool) -> float:
     for line in textwrap.wrap(text, 108):
         weight, x = ("bold", 0.08) if bold else ("normal", 0.1)
-        figure.text(x, y_in / _PAGE_IN[1], line, fontsize=9, fontweight=weight)
+        figure.text(x, y_in / _PAGE_IN[1], line, fontsize=9, fontweight=weight, parse_math=False)
         y_in -= 0.175
     return y_in
 
