@@ -257,7 +257,7 @@ def _show_plan(job: Job, runner: "RunnerConfig") -> int:
 
 def _clip_list(source: Path, more: tuple[Path, ...], out: Path) -> Path:
     """The list of several clips, written into the run folder."""
-    from velfield.run.layout import is_remote, to_path
+    from velfield.run.layout import RunLayout, is_remote, to_path
     from velfield.sources.clips import CLIPS_SUFFIX, read_clip_list, write_clip_list
     from velfield.sources.frames import local_path
 
