@@ -28,7 +28,7 @@ def _run(source: Path, root: Path, *settings: str) -> Run:
 
 def _both(run: Run) -> tuple[pd.DataFrame, pd.DataFrame]:
     """What the shipped weights alone detect, and that with what tracks confirm."""
-    alone = read_tables(sorted(run.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
+    alone = read_tables(run.layout.unit_files(run.layout.detections), DETECTION_COLUMNS)
     return alone, run.detections(doubtful=True)
 
 

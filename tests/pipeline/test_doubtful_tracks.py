@@ -21,7 +21,7 @@ def ids(table: pd.DataFrame, name: str = "track_id") -> set[int]:
 
 def apart(run: Run, tracks: set[int]) -> pd.DataFrame:
     """Positions of some doubtful tracks."""
-    table = read_tables(sorted(run.layout.doubtful_positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS)
+    table = read_tables(run.layout.unit_files(run.layout.doubtful_positions), TRACK_POSITION_COLUMNS)
     return table[table["track_id"].isin(tracks)]
 
 

@@ -227,3 +227,8 @@ class RunLayout:
         'RUN/detections/unit-00003.parquet'
         """
         return folder / f"unit-{unit:05d}.parquet"
+
+    @staticmethod
+    def unit_files(folder: Path) -> list[Path]:
+        """The files of all units of frames that are in ``folder``, in their order."""
+        return sorted(folder.glob("unit-*.parquet"))

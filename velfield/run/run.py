@@ -209,7 +209,7 @@ class Run:
     def _all_detections(self, names: list[str]) -> pd.DataFrame:
         self.require_frames()
         sure, weak = (
-            read_tables(sorted(folder.glob("unit-*.parquet")), DETECTION_COLUMNS, only=names)
+            read_tables(self.layout.unit_files(folder), DETECTION_COLUMNS, only=names)
             for folder in (self.layout.detections, self.layout.weak_detections)
         )
         seen = [self._detections_in(at) for at in (self.layout.track_positions, self.layout.doubtful_positions)]
@@ -218,7 +218,7 @@ class Run:
 
     def _detections_in(self, positions: Path) -> IntArray:
         """Ids of the detections in a folder of positions."""
-        table = read_tables(sorted(positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS, only=["detection_id"])
+        table = read_tables(self.layout.unit_files(positions), TRACK_POSITION_COLUMNS, only=["detection_id"])
         return table["detection_id"].to_numpy(np.int64)
 
     def tracklets(self) -> pd.DataFrame:
@@ -228,7 +228,7 @@ class Run:
     def _tracklets_of(self, folder: Path, names: Iterable[str]) -> pd.DataFrame:
         """Some columns of the tracklets in a folder: all of them are much, of a long flight."""
         self.require_frames()
-        return read_tables(sorted(folder.glob("unit-*.parquet")), TRACK_COLUMNS, only=list(names))
+        return read_tables(self.layout.unit_files(folder), TRACK_COLUMNS, only=list(names))
 
     def vehicles(self, *, doubtful: bool = False) -> pd.DataFrame:
         """One row a track, by ``track_id``: when and where, its length, width and class, and whether it moves, waits in
@@ -258,7 +258,7 @@ class Run:
         ``source`` distinguishes what is seen from what is inferred, by name (``POSITION_SOURCES``).
         """
         self.require_frames()
-        table = read_tables(sorted(self.layout.track_positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS)
+        table = read_tables(self.layout.unit_files(self.layout.track_positions), TRACK_POSITION_COLUMNS)
         return table.assign(source=pd.Categorical.from_codes(table["source"], pd.Index(POSITION_SOURCES)))
 
     def joins(self) -> pd.DataFrame:

@@ -146,7 +146,7 @@ def _segments_near(plan: Plan, writers: Sequence[GroupWriter]) -> Segments:
 def _tracklets_near(plan: Plan, low_xy: tuple[float, float], high_xy: tuple[float, float]) -> pd.DataFrame:
     """All tracklets of the tracks that come into a rectangle, table by table: of a long flight all at once would take
     gigabytes."""
-    paths = sorted(plan.layout.tracks.glob("unit-*.parquet"))
+    paths = plan.layout.unit_files(plan.layout.tracks)
     read = partial(read_tables, columns=TRACKLET_COLUMNS)
     if not paths:
         return read([], only=list(SEGMENT_COLUMNS))

@@ -226,7 +226,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     ids, counts = {}, {}
     for name, source, target in (("tracks", old.tracks, layout.tracks), ("doubtful", old.doubtful, layout.doubtful)):
         ids[name], counts[name] = set[int](), 0
-        for path in sorted(source.glob("unit-*.parquet")):
+        for path in layout.unit_files(source):
             table = map_tracklets(read_tables([path], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
             written.append(target / path.name)
             write_tracks(written[-1], table)
@@ -237,7 +237,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
         (old.track_positions, layout.track_positions),
         (old.doubtful_positions, layout.doubtful_positions),
     ):
-        for path in sorted(source.glob("unit-*.parquet")):
+        for path in layout.unit_files(source):
             table = read_tables([path], TRACK_POSITION_COLUMNS)
             table[["x_px", "y_px"]] = transform(table[["x_px", "y_px"]].to_numpy(np.float64))
             written.append(target / path.name)

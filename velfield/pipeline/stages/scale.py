@@ -76,7 +76,7 @@ def _path_extent_px(layout: RunLayout) -> pd.Series:
     names = ["track_id", "x_1_px", "y_1_px"]
     boxes = [
         read_tables([path], TRACK_COLUMNS, only=names).groupby("track_id").agg(["min", "max"])
-        for path in sorted(layout.tracks.glob("unit-*.parquet"))
+        for path in layout.unit_files(layout.tracks)
     ]
     if not boxes:
         return pd.Series(dtype=np.float64)
@@ -102,7 +102,7 @@ def _check_times(plan: Plan, record: GeoreferenceRecord) -> tuple[list[str], lis
     if used is None:
         return [], []
     paths, size = [], 0
-    for path in sorted(plan.layout.tracks.glob("unit-*.parquet")):
+    for path in plan.layout.unit_files(plan.layout.tracks):
         paths.append(path)
         size += path.stat().st_size
         if size > _CHECKED_BYTES:

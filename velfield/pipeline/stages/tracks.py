@@ -107,7 +107,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     written = [path for paths, _, _ in parts for path in paths]
     recovered, lone = sum(number for _, number, _ in parts), sum(number for _, _, number in parts)
     for folder in (layout.tracks, layout.track_positions, layout.doubtful, layout.doubtful_positions):
-        for stale in set(folder.glob("unit-*.parquet")) - set(written):
+        for stale in set(layout.unit_files(folder)) - set(written):
             stale.unlink()  # of an earlier plan with more units
     for path, table, columns in (
         (layout.dimensions, measure_tracks(images), DIMENSION_COLUMNS),
