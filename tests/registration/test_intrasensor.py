@@ -12,13 +12,11 @@ from schemas.flight import RegistrationConfig
 from schemas.simulation import CameraSimulation, OtherSensorSimulation
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.errors import Failure
-from velfield.registration import intrasensor
+from velfield.registration import frame_fit, intrasensor
 from velfield.registration.alignment import Templates, align_patches, make_templates, smooth_fine
+from velfield.registration.frame_fit import BaseReference, FrameFitter, FrameRegistration
 from velfield.registration.intrasensor import (
-    BaseReference,
     ChainFrame,
-    FrameRegistration,
-    _FrameFitter,
     _PatchHistory,
     map_keypoints,
     prepare_base,
@@ -158,11 +156,11 @@ def test_a_right_fit_stays_as_it_is(kind: str) -> None:
     assert fitter._bridge_weak_rows(points, fit, templates)[1] is fit
 
 
-def fitted(kind: str) -> tuple[_FrameFitter, tuple[ControlPoints, JointFit], Templates]:
+def fitted(kind: str) -> tuple[FrameFitter, tuple[ControlPoints, JointFit], Templates]:
     """The fit of the first frame with what it was made of."""
     (grey, _), base, lens = seen(kind, 0), base_of(kind), lens_of(flight_of(kind))
     result = registered(kind, [0])[0]
-    fitter, points = _FrameFitter(grey, base, lens, CONFIG), result.control_points
+    fitter, points = FrameFitter(grey, base, lens, CONFIG), result.control_points
     fit = fitter._fit(points, result.transform.polyprojective)
     return fitter, (points, fit), base.templates
 
@@ -236,7 +234,7 @@ def test_a_fit_that_shows_no_patch_of_the_base_image_is_a_failure_with_the_count
 ) -> None:
     """As for strange images, whose keypoints match by chance."""
     fitter, (points, fit), _ = fitted("still")
-    monkeypatch.setattr(intrasensor, "align_patches", lambda *_a, **_k: (points.select(np.zeros(len(points), bool)), 0))
+    monkeypatch.setattr(frame_fit, "align_patches", lambda *_a, **_k: (points.select(np.zeros(len(points), bool)), 0))
     found = fitter.fit_with_alignment(points, fit.transform.polyprojective)
     assert isinstance(found, Failure)
     assert found.reason == "0 of 0 patches of the base image align"
@@ -359,7 +357,7 @@ def test_a_chain_by_optical_flow_counts_only_what_it_measured_against_the_base_i
         points, shown = align_patches(*arguments, **options)
         return points.select(points.xy_raw[:, 0] < 558), shown
 
-    monkeypatch.setattr(intrasensor, "align_patches", align_on_the_left)
+    monkeypatch.setattr(frame_fit, "align_patches", align_on_the_left)
     monkeypatch.setattr(intrasensor, "_is_worse", lambda *_: False)
     first, *by_flow = registered("still", [0, 1, 2, 3])
     assert (first.control_points.xy_raw[:, 0] > 562).any()

@@ -26,7 +26,8 @@ from velfield.errors import Failure
 from velfield.parallel import parallel_map, usable_processors
 from velfield.registration import kernels
 from velfield.registration.background import NOT_COVERED, median_of_stack
-from velfield.registration.intrasensor import BaseReference, ChainFrame, FrameRegistration, prepare_base, register_chain
+from velfield.registration.frame_fit import BaseReference, FrameRegistration
+from velfield.registration.intrasensor import ChainFrame, prepare_base, register_chain
 from velfield.registration.joint import ControlPoints
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, fit_normalisation

@@ -17,7 +17,8 @@ from velfield.camera.map_fit import MapFit, fit_lens_to_map, mean_lens
 from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
-from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_frame
+from velfield.registration.frame_fit import BaseReference, FrameRegistration
+from velfield.registration.intrasensor import prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints
 from velfield.run.commits import write_atomically
 from velfield.run.stores import open_frames

@@ -17,7 +17,8 @@ from velfield.camera.tilt import FOCAL_HALF_DIAGONALS, MIN_TURN
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.alignment import Templates
-from velfield.registration.intrasensor import BaseReference, FrameRegistration, register_chain
+from velfield.registration.frame_fit import BaseReference, FrameRegistration
+from velfield.registration.intrasensor import register_chain
 from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.transforms import FrameTransform, vector_length
 from velfield.run.frame_transforms import read_grid, read_lens
