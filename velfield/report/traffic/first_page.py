@@ -30,14 +30,19 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     """The first page's words, with speeds in a unit: km/h or mph."""
     found: dict[str, list[str]] = {}
     withheld: list[str] = []
-    reasons: dict[str, str] = {}
+    reasons: dict[str, list[str]] = {}
     for answer in find_answers(analysis, unit=unit):
-        text = f"{answer.subject}: {answer.text}" if answer.subject else answer.text
+        place = f"{answer.subject}: " if answer.subject else ""
+        text = place + answer.text
         if answer.state == "too little data":
             withheld.append(f"{answer.topic}: {text}")
-            reasons.setdefault(answer.topic, text.removeprefix("too little data: "))
+            reasons.setdefault(answer.topic, []).append(place + answer.text.removeprefix("too little data: "))
         else:
             found.setdefault(answer.topic, []).append(text)
+
+    def why(topic: str, otherwise: str) -> str:
+        return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
+
     events = [f"{topic}: {text}" for topic in ("conflicts", "u-turns", "unusual") for text in found.get(topic, [])[:1]]
     no_junction = "no junction of lanes was found"
     questions = (
@@ -51,13 +56,13 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             _waits(analysis),
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
-        ("Is there a signal?", found.get("signal", []), reasons.get("signal", no_junction)),
+        ("Is there a signal?", found.get("signal", []), why("signal", no_junction)),
         (
             "How fast do vehicles drive?",
             found.get("speed", []) or found.get("mean speed", []),
-            reasons.get("speed", "no lane was found"),
+            why("speed", "no lane was found"),
         ),
-        ("Where is it dangerous?", events, reasons.get("conflicts", "no lane was found")),
+        ("Where is it dangerous?", events, why("conflicts", "no lane was found")),
     )
     n = len(analysis.trajectories)
     seen = f"{n} vehicle{'s' if n != 1 else ''} that move, in {duration_text(analysis.trajectories.duration_s)}"
