@@ -75,12 +75,16 @@ def test_without_frames_there_is_no_strip(analysis: TrafficAnalysis) -> None:
 
 def test_the_report_and_the_table_show_it(analysis: TrafficAnalysis, tmp_path: Path) -> None:
     place = Georeference((HEIGHT, WIDTH), gsd_m=GSD_M)
-    list(write_analysis(analysis, tmp_path, place, gsd_known=True, picture=None, frames=frames(analysis)))
+    list(
+        write_analysis(
+            analysis, tmp_path, place, about="a flight", gsd_known=True, picture=None, frames=frames(analysis)
+        )
+    )
     assert (tmp_path / "clips" / "unusual-000.jpg").is_file()
     assert "clips/unusual-000.jpg" in (tmp_path / "analysis.json").read_text()
     text = (tmp_path / "report.html").read_text()
     assert text.count("<figure>") == 1
     assert "wrong way, track 12" in text
-    list(write_analysis(analysis, tmp_path, place, gsd_known=True, picture=None))
+    list(write_analysis(analysis, tmp_path, place, about="a flight", gsd_known=True, picture=None))
     assert not (tmp_path / "clips").exists()
     assert "<figure>" not in (tmp_path / "report.html").read_text()

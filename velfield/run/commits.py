@@ -199,7 +199,8 @@ def record_analysis(layout: RunLayout, *, slice_s: float) -> None:
     """Record the files of the analysis, and with which slices of time it was made, likewise; and the content key of the
     results that were analysed, which may be older than the settings."""
     files = [path for path in layout.analysis.rglob("*") if path.is_file()]
-    keys = {record.stage: record.key for stage in ("tracks", "scale") for record in read_commits(layout, stage)}
+    analysed = *read_commits(layout, "tracks"), *read_commits(layout, "scale")
+    keys = {record.stage: record.key for record in analysed}
     _record_files(layout, ANALYSIS, files, key=_analysed(keys), slice_s=slice_s)
 
 
