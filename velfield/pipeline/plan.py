@@ -214,12 +214,18 @@ def _digest_source(path: Path, info: SourceInfo) -> str:
     return digest_bytes(" ".join(map(digest_path, clip_files(path))).encode())
 
 
+def _last_run(plan: Plan) -> FlightRecord | None:
+    """The record of the last run in this folder; None if it is new, or of another format: everything is recomputed."""
+    try:
+        return read_flight_record(plan.layout.root) if plan.layout.flight.exists() else None
+    except InputError:
+        return None
+
+
 def dropped_inputs(plan: Plan) -> list[str]:
     """A line for each optional input that the last run in this folder was given and this one is not."""
-    try:
-        before = read_flight_record(plan.layout.root).given if plan.layout.flight.exists() else None
-    except InputError:
-        return []
+    last = _last_run(plan)
+    before = last and last.given
     instead = {"base": "the base image is built from the flight", "labels": "cars are not labelled"}
     return [
         f"--{name} {path} was given to the run before in {plan.layout.root} and is not given now"
@@ -240,10 +246,7 @@ def check_same_flight(plan: Plan) -> None:
     InputError
         It does.
     """
-    try:
-        old = read_flight_record(plan.layout.root) if plan.layout.flight.exists() else None
-    except InputError:
-        return  # a record that cannot be read protects nothing
+    old = _last_run(plan)
     if old is None or old.given is None or old.inputs.source.digest == plan.inputs.source.digest:
         return
     if old.given.source != plan.job.inputs.source:
@@ -255,12 +258,9 @@ def check_same_flight(plan: Plan) -> None:
 
 def changed_since(plan: Plan) -> list[str]:
     """Inputs and settings that changed since the last run in this folder; none if it is new or of another format."""
-    if not plan.layout.flight.exists():
+    old = _last_run(plan)
+    if old is None:
         return []
-    try:
-        old = read_flight_record(plan.layout.root)
-    except InputError:
-        return []  # that version's stages have other keys as well: everything is recomputed
     moved = old.inputs.source.model_copy(update={"path": plan.inputs.source.path})
     before = old.inputs.model_copy(update={"source": moved})
     inputs = [name for name in InputsRecord.model_fields if getattr(before, name) != getattr(plan.inputs, name)]

@@ -1,6 +1,7 @@
 """Volume, density and space-mean speed of lanes by Edie's definitions; headways; levels of service."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -47,16 +48,22 @@ class LaneFlow:
 
 @dataclass(frozen=True)
 class FlowSlices:
-    """Edie's flow (veh/h), density (veh/km) and speed (m/s; NaN without traffic) of a lane by slice of time, with the
-    number of vehicles."""
+    """Edie's flow (veh/h), density (veh/km) and speed (m/s; NaN without traffic) of a lane by slice of time."""
 
     slices: ObservedSlices
     flow_veh_per_h: FloatArray
     density_veh_per_km: FloatArray
     speed_m_per_s: FloatArray
-    vehicles: IntArray
+    samples: LaneSamples
 
-    @property
+    @cached_property
+    def vehicles(self) -> IntArray:
+        """Number of vehicles on the lane by slice."""
+        number = self.slices.number(self.samples.time_s)
+        pairs = np.unique(np.column_stack([number, self.samples.track])[number >= 0], axis=0)
+        return np.bincount(pairs[:, 0], minlength=len(self.slices))
+
+    @cached_property
     def points(self) -> IntArray:
         """The slices that are points of the lane's fundamental diagram: with vehicles enough, and long enough."""
         lasts = self.slices.end_s - self.slices.begin_s >= _MIN_SLICE_S
@@ -114,10 +121,7 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
         spent += slices.sums(at, wait / 8)
     area = length * np.maximum(slices.end_s - slices.begin_s, 1e-9)
     speed = np.divide(driven, spent, out=np.full(len(slices), np.nan), where=spent > 0)
-    number = slices.number(samples.time_s)
-    pairs = np.unique(np.column_stack([number, samples.track])[number >= 0], axis=0)
-    vehicles = np.bincount(pairs[:, 0], minlength=len(slices))
-    return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed, vehicles)
+    return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed, samples)
 
 
 def _steps(samples: LaneSamples) -> tuple[IntArray, FloatArray, FloatArray]:

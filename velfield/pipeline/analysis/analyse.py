@@ -73,9 +73,8 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
 def _about(run: Run) -> str:
     """The source, when it was filmed, and the scale with its interval."""
     source, place = run.record.inputs.source, read_georeference(run.layout)
-    scale = place.scale.used if place else None
-    name = source_name(source.path, source.kind)
-    return ", ".join([name, *([run.start.text()] if run.start else []), *([scale.text()] if scale else [])])
+    known = (place.start, place.scale.used) if place else ()
+    return ", ".join([source_name(source.path, source.kind), *(one.text() for one in known if one is not None)])
 
 
 def _frames(run: Run) -> Frames | None:

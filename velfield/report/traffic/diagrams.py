@@ -23,6 +23,7 @@ _TONES = ("#1f3b73", "#c8553d", "#3a8f6b", "#8a6fb0", "#b08a1e", "#5b6770")
 _STROKES = ("-", "--", "-.", ":")
 _MARKS = "os^Dvx"
 _RED = "#c62828"
+_PALE_BOX = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
 _MAX_JUNCTIONS = 4
 _SHOWN_S, _SLICE_S = 300.0, 60.0
 _BESIDE_M, _AHEAD_RAD = 2.5, np.radians(45)
@@ -168,15 +169,13 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
             at = lane.at(lane.length_m / 2), lane.at(lane.length_m / 2 + 3)
             style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 11}
             axes.annotate("", xy=(at[1][0], at[1][1]), xytext=(at[0][0], at[0][1]), arrowprops=style)
-            box = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
             x, y = lane.at(lane.length_m / 3)
-            axes.text(x, y, str(lane.number), ha="center", va="center", fontsize=6.5, color="#0b4f8a", bbox=box)
+            axes.text(x, y, str(lane.number), ha="center", va="center", fontsize=6.5, color="#0b4f8a", bbox=_PALE_BOX)
     for junction in analysis.lanes.junctions:
-        level = _is_junction(analysis, junction.number)
+        kind = analysis.junction_kind(junction.number)
         box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
-        crossing = analysis.junction_kind(junction.number) == "crossing"
-        box["linestyle"] = "--" if crossing else "-"
-        size = 11 if level or crossing else 6.5  # small where lanes only merge or part
+        box["linestyle"] = "--" if kind == "crossing" else "-"
+        size = 6.5 if kind in ("merge", "diverge") else 11
         x, y = junction.centre_m
         axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=size, fontweight="bold", bbox=box)
     for arm in analysis.scene.arms if analysis.scene else ():
@@ -195,10 +194,8 @@ def _draw_scale(axes: "Axes") -> None:
     length = power * max(step for step in (1, 2, 5) if step * power <= longest)
     x, y = left + 0.03 * (right - left), bottom + 0.04 * (top - bottom)
     axes.plot([x, x + length], [y, y], color="#1b1f24", linewidth=3, solid_capstyle="butt")
-    box = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
-    axes.text(
-        x + length / 2, y + 0.02 * (top - bottom), f"{length:g} m", ha="center", va="bottom", fontsize=7, bbox=box
-    )
+    above = y + 0.02 * (top - bottom)
+    axes.text(x + length / 2, above, f"{length:g} m", ha="center", va="bottom", fontsize=7, bbox=_PALE_BOX)
 
 
 def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
