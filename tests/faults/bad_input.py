@@ -59,8 +59,12 @@ class Kind:
     weight: int = 1
 
     def __repr__(self) -> str:
-        """Name alone: the files are megabytes, which hypothesis refuses to print with the case that failed."""
+        """Name alone: the files are megabytes."""
         return f"Kind({self.name!r})"
+
+    def _repr_pretty_(self, printer: Any, _cycle: bool) -> None:
+        """What hypothesis prints with the case that failed, in place of the fields."""
+        printer.text(repr(self))
 
 
 def mutate(data: bytes, others: tuple[bytes, ...], rng: np.random.Generator) -> bytes:
