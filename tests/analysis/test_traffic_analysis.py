@@ -215,6 +215,18 @@ def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
     assert 0.5 < first.probability <= 1.0
 
 
+@pytest.mark.parametrize("wobble_m", [0.0, 0.5])
+def test_who_goes_round_a_circle_and_back_makes_no_u_turn_though_errors_straighten_the_circle(wobble_m: float) -> None:
+    angle = np.linspace(0.75 * np.pi, -0.75 * np.pi, 80)  # from the bend of one arm to the same arm's other side
+    radius = 13.0 + wobble_m * np.sin(5.0 * angle)
+    circle = np.array([130.0, 100.0]) + radius[:, None] * np.column_stack([-np.cos(angle), np.sin(angle)])[::-1]
+    arm = np.array([[230.0, 98.0], [152.0, 98.0], [142.0, 104.0]])
+    path = np.concatenate([arm * [1, -1] + [0, 200], circle, arm[::-1]])
+    analysis = TrafficAnalysis(gather([drive(path, 30.0 * k) for k in range(2)]))
+    assert len(analysis.trajectories) == 2
+    assert analysis.reversals == []
+
+
 def test_a_vehicle_that_touches_the_end_of_another_lane_merges_by_its_own() -> None:
     angle = np.linspace(np.pi, np.pi / 2, 20)
     arc = np.array([160.0, 90.0]) + 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -450,6 +462,16 @@ def test_few_pairs_that_cross_where_levels_are_not_clear_are_neither_conflicts_n
     junction = analysis.lanes.junctions[0].hull_m
     signalised = find_conflicts(analysis.trajectories, analysis.lane_traffic, signalised_m=[junction])
     assert sum(c.kind == "crossing" and c.probability > 0.5 for c in signalised) == 4
+
+
+@pytest.mark.parametrize(("gap_m", "state"), [(1.5, "found"), (2.1, "too little data"), (4.0, "none")])
+def test_pairs_that_errors_leave_in_doubt_are_neither_counted_nor_denied(gap_m: float, state: str) -> None:
+    tracks = [drive(EAST, 8.0 * k) for k in range(12)]
+    tracks += [track for start_s in (120.0, 180.0) for track in approach(start_s, 30.0, 12.0, 6.0, gap_m)]
+    analysis = TrafficAnalysis(gather(tracks))
+    (answer,) = (a for a in find_answers(analysis) if a.topic == "conflicts")
+    assert answer.state == state
+    assert sum(c.likely for c in analysis.conflicts) == (2 if state == "found" else 0)
 
 
 def in_two_clips(

@@ -59,7 +59,9 @@ def make_cases(seed: int, *, clips: int = CLIPS) -> Iterator[Case]:
         seconds, keep, every = rng.uniform(20, 90), rng.choice([1.0, 1.0, 0.6]), rng.choice([1, 1, 2])
         begin = rng.uniform(0, FLIGHT_S - seconds)
         noise = NOISES[rng.integers(len(NOISES))]
-        piece = _sparse(clip(whole, begin, begin + seconds), keep, every, rng)
+        every_track = clip(whole, begin, begin + seconds)
+        piece = _sparse(every_track, keep, every, rng)
+        left_out = np.setdiff1d(every_track.vehicle, piece.vehicle)
         lengths, classes = made.city.traffic.dimensions.length_m, None
         if rng.uniform() < 0.5:
             sd = float(rng.choice([0.04, 0.1]))
@@ -71,7 +73,11 @@ def make_cases(seed: int, *, clips: int = CLIPS) -> Iterator[Case]:
         analysis = analyse(piece, noise, seed=seed + k, lengths_m=lengths, parked=parked, classes=classes)
         turns = tuple(true_u_turns(piece, middles, seen_m=m) for m in (20.0, 0.0))
         name = f"{seed}/{k} {seconds:.0f} s {'signal' if signals else 'no signal'} {keep:g} 1/{every} {noise}"
-        yield Case(name, analysis, Truth(made, signals, piece, scene), (turns[0], turns[1]))
+        seen = scene
+        if len(left_out):
+            others = ~np.isin(whole.vehicle, left_out)
+            seen = analyse(whole.select(others[whole.owner]), Noise(), lengths_m=made.city.traffic.dimensions.length_m)
+        yield Case(name, analysis, Truth(made, signals, piece, seen), (turns[0], turns[1]))
 
 
 def turn_middles_m(made: Flight) -> list[np.ndarray]:

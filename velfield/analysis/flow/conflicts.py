@@ -28,6 +28,8 @@ tracks without further errors."""
 HARD_BRAKING_M_PER_S2 = 3.4
 """Drivers brake by this, and no harder, where nothing surprises them (AASHTO, A Policy on Geometric Design, 3.2.2): who
 closes up on a queue so has less than 1.5 s to collision, and no conflict."""
+LIKELY = 0.8
+"""Probability from which on a conflict is counted: at one half every other of the doubtful ones is none."""
 _MIN_SPEED_M_PER_S = 1.0
 _MIN_FOLLOWER_M_PER_S = 3.0
 _OVERLAP_M = 1.0
@@ -82,8 +84,13 @@ class Conflict:
 
     @property
     def likely(self) -> bool:
-        """Whether it is more likely than not a conflict, of roads that are clearly on one level."""
-        return self.on_one_level and self.probability >= 0.5
+        """Whether it is a conflict with a probability of `LIKELY` or more, of roads that are clearly on one level."""
+        return self.on_one_level and self.near
+
+    @property
+    def near(self) -> bool:
+        """Whether it would be likely if the roads were on one level."""
+        return self.probability >= LIKELY * self.one_level
 
 
 def find_conflicts(

@@ -20,7 +20,8 @@ _LEG_M, _LEG_SIGMAS = 8, 24.0
 the opposite way."""
 _OPPOSITE_RAD = np.radians(150)
 _BEND_M, _BEND_RAD = 8, np.radians(20)
-"""A turn goes on where the next so many metres bend on by more."""
+"""A turn goes on where the next so many metres bend on by more; or twice as many by twice as much, as errors that last
+straighten parts of it."""
 _STRAIGHT_M = 16
 """Between the bends of a circle and of its arms the course is straight over less."""
 _CIRCLE_RAD = np.radians(215)
@@ -96,15 +97,15 @@ def _turn_rows(track: IntArray, course: FloatArray, row: int) -> tuple[int, int]
 
     def bends(a: int, b: int) -> bool:
         inside = a >= 0 and b < len(track) and track[a] == track[row] == track[b]
-        return bool(inside and sense * (course[b] - course[a]) > _BEND_RAD)
+        return bool(inside and sense * (course[b] - course[a]) > _BEND_RAD * (b - a) / _BEND_M)
 
     while start < end and not bends(start, start + _BEND_M):
         start += 1
     while end > start and not bends(end - _BEND_M, end):
         end -= 1
-    while bends(start - _BEND_M, start):
+    while any(bends(start - m, start) for m in (_BEND_M, 2 * _BEND_M)):
         start -= 1
-    while bends(end, end + _BEND_M):
+    while any(bends(end, end + m) for m in (_BEND_M, 2 * _BEND_M)):
         end += 1
     return start, end
 

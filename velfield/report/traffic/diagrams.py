@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.export import PER_M_PER_S, SpeedUnit
+from velfield.analysis.flow.conflicts import LIKELY
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import StreamSignal, queues
@@ -83,7 +84,8 @@ def traffic_diagrams(
         yield Diagram(
             "conflicts",
             "Where vehicles come near to each other",
-            f"{len(likely)} pairs that are more likely than not within 1.5 s of a collision, or of each other.",
+            f"{len(likely)} pairs that are within 1.5 s of a collision, or of each other, with a probability of "
+            f"{LIKELY} or more.",
             partial(draw_conflicts, analysis=analysis, picture=picture),
             4.6,
         )
