@@ -24,6 +24,9 @@ STATION_M = 10.0
 """Length of a profile's stations."""
 _FREE_HEADWAY_S = 4.0
 """A vehicle whose leader is further ahead follows nobody."""
+_UNSEEN_HEADWAY_S, _ALIKE = 8.0, 0.03
+"""One whose leader is nearer than this, and as fast but for this fraction, may follow another that was not seen: it
+counts neither as free nor as following."""
 _FOLLOWS_HEADWAY_S = (2.0, 3.0)
 """One whose leader is nearer goes no faster than it would like: from which headway on is not known better than this."""
 _STEADY_M, _STEADY = 30.0, 0.03
@@ -133,7 +136,8 @@ def _by_vehicle(
     """The fastest steady stretch of each vehicle, as it goes slowly for other reasons too, and whether it goes freely
     there; else it would like to go faster. ``follows_s``: headway below which a vehicle follows."""
     free = headway_s > _FREE_HEADWAY_S
-    used = np.flatnonzero(free | (headway_s < follows_s))
+    doubtful = np.isin(tracks, tracks[np.isnan(headway_s)])
+    used = np.flatnonzero((free & ~doubtful) | (headway_s < follows_s))
     order = used[np.lexsort((-speeds[used], tracks[used]))]
     best = order[np.unique(tracks[order], return_index=True)[1]]
     return speeds[best], (free & ~rises)[best]
@@ -212,9 +216,14 @@ def _of_windows(values: FloatArray, steps: int, of: np.ufunc) -> FloatArray:
 
 
 def traffic_passings(samples: LaneSamples, at_m: float) -> tuple[IntArray, FloatArray]:
-    """Tracks at a place and their headways, s; the first has none and counts as free."""
+    """Tracks at a place and their headways, s: infinite for the first, which counts as free; NaN for one that may
+    follow an unseen vehicle."""
     found = find_passings(samples, at_m)
-    return found.track, np.nan_to_num(found.headway_s, nan=np.inf)
+    headway_s = np.nan_to_num(found.headway_s, nan=np.inf)
+    leads = np.roll(found.speed_m_per_s, 1)
+    alike = np.abs(found.speed_m_per_s - leads) < _ALIKE * leads
+    unseen = alike & (headway_s > _FREE_HEADWAY_S) & (headway_s < _UNSEEN_HEADWAY_S)
+    return found.track, np.where(unseen, np.nan, headway_s)
 
 
 def roads(graph: LaneGraph) -> list[list[int]]:

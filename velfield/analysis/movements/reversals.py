@@ -24,6 +24,8 @@ _BEND_M, _BEND_RAD = 8, np.radians(20)
 straighten parts of it."""
 _STRAIGHT_M = 16
 """Between the bends of a circle and of its arms the course is straight over less."""
+_ARM_M = 20
+"""The ways are opposite so far from the turn, too: the arm by which a circle is left after a part of it is not."""
 _CIRCLE_RAD = np.radians(215)
 """Who turns by more goes round a circle: it is entered, and left, by a bend the other way."""
 
@@ -70,10 +72,18 @@ def _goes_back(samples: PathSamples, course: FloatArray, row: int, position_sd_m
         return False
     start, end = _straight(samples.track, course, start, -1), _straight(samples.track, course, end, 1)
     leg = max(_LEG_M, int(np.ceil(_LEG_SIGMAS * position_sd_m)))
-    rows = np.array([start - leg, start, end, end + leg])
-    if rows[0] < 0 or rows[-1] >= len(samples) or np.ptp(samples.track[rows]):
+    first, last = np.searchsorted(samples.track, samples.track[row] + np.arange(2)) - np.arange(2)
+    if start - leg < first or end + leg > last:
         return False
-    ways = samples.xy_m[rows[[1, 3]]] - samples.xy_m[rows[[0, 2]]]
+    return all(
+        _opposite(samples.xy_m, max(start - away, first + leg), min(end + away, last - leg), leg)
+        for away in (0, _ARM_M)
+    )
+
+
+def _opposite(xy_m: FloatArray, start: int, end: int, leg: int) -> bool:
+    """Whether the ways of so many rows before ``start`` and after ``end`` are opposite."""
+    ways = xy_m[[start, end + leg]] - xy_m[[start - leg, end]]
     turn = np.abs(np.angle(np.exp(1j * float(np.subtract(*np.arctan2(ways[:, 1], ways[:, 0]))))))
     return bool(np.hypot(*ways.T).min() > 0.7 * leg and turn >= _OPPOSITE_RAD)
 
