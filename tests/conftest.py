@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from flows.launch import prepare_process, spare_proxies
@@ -16,6 +17,10 @@ from tests.s3_server import s3_server
 from tests.small_flight import FRAMES, digests, job, process
 
 FOOTAGE = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+# How long a case takes depends on the machine, and on whether it is the first that compiles.
+hypothesis.settings.register_profile("velfield", deadline=None)
+hypothesis.settings.load_profile("velfield")
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and all that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

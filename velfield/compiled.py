@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from numba import njit
+from numba import njit, types
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -13,8 +13,20 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
 
     Further options are `numba.njit`'s: ``error_model="numpy"``, ``fastmath=True``.
     """
-    decorator: Callable[[Function], Function] = njit(cache=True, nogil=True, **options)
-    return decorator
+
+    def decorate(function: Function) -> Function:
+        dispatcher: Any = njit(cache=True, nogil=True, **options)(function)
+        find = dispatcher.get_call_template
+
+        def find_without_literals(args: tuple[Any, ...], kws: dict[str, Any]) -> Any:
+            """Another kernel's call: numba would compile anew for each number that stands in a call."""
+            return find(tuple(map(types.unliteral, args)), {name: types.unliteral(kind) for name, kind in kws.items()})
+
+        dispatcher.get_call_template = find_without_literals
+        compiled_function: Function = dispatcher
+        return compiled_function
+
+    return decorate
 
 
 def kernel(function: Function) -> Function:

@@ -54,7 +54,7 @@ def bars(seed: int = 0) -> LabelledImage:
     return sample(image, np.array(cars, float))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(INSIDE, INSIDE, ANGLES)
 def test_a_car_is_decoded_from_its_target_maps(x: float, y: float, angle: float) -> None:
     heatmap, orientation, weight = encode_targets(np.array([[x, y]]), np.array([angle]))
@@ -82,7 +82,7 @@ def test_the_heatmap_is_a_gaussian() -> None:
     assert heatmap[25, 20] == 1
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.permutations(range(5)))
 def test_where_cars_overlap_the_nearest_one_counts(order: list[int]) -> None:
     centres = np.array([[20.0, 20], [27, 20], [20, 31], [60, 60], [63, 64]])

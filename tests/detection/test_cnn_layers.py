@@ -70,7 +70,7 @@ def sized(taps: int, size: int) -> int:
     return 2 * size if taps == 16 else size
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(1, 3), SIZES, SIZES, CHANNELS, CHANNELS, st.sampled_from([1, 9, 16]))
 def test_conv2d_equals_scipy_for_any_size(
     n: int, h: int, w: int, channels_in: int, channels_out: int, taps: int
@@ -85,7 +85,7 @@ def test_conv2d_equals_scipy_for_any_size(
     np.testing.assert_array_equal(conv2d(images, weights, bias, relu=True), np.maximum(out + bias, 0))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SIZES, SIZES, CHANNELS, CHANNELS, st.sampled_from([1, 9, 16]))
 def test_conv2d_backward_is_adjoint(h: int, w: int, channels_in: int, channels_out: int, taps: int) -> None:
     """conv2d is linear in its input and in its weights: <conv2d(x, v), g> = <x, dx> = <v, dv> for any x and v."""
@@ -147,7 +147,7 @@ def test_space_to_depth_orders_channels_by_row_then_column_of_the_block() -> Non
     assert space_to_depth(coordinates)[0, 1, 0].tolist() == [2, 0, 2, 1, 3, 0, 3, 1]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(1, 3), st.integers(1, 5), st.integers(1, 5), CHANNELS)
 def test_depth_to_space_inverts_space_to_depth(n: int, half_h: int, half_w: int, channels: int) -> None:
     images = normal(n, 2 * half_h, 2 * half_w, channels)

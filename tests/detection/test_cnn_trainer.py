@@ -197,7 +197,7 @@ def test_the_learning_rate_warms_up_and_decays_along_a_cosine() -> None:
     assert lr_schedule(1) == pytest.approx(1e-3)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_the_learning_rate_rises_then_falls(one: float, other: float) -> None:
     early, late = sorted((one, other))

@@ -31,7 +31,7 @@ def held_out(seed: int, detections: int = 60, cars: int = 40, complete: bool = T
 
 
 @given(SEEDS, st.integers(0, 25), st.integers(0, 25))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_greedy_matching_is_the_naive_loop(seed: int, n: int, m: int) -> None:
     rng = np.random.default_rng(seed)
     detections, cars = rng.uniform(0, 60, (n, 4)), rng.uniform(0, 60, (m, 3))
@@ -54,7 +54,7 @@ def test_a_second_detection_of_a_car_is_false() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_precision_and_recall_are_those_of_a_naive_loop(seed: int) -> None:
     scores = held_out(seed)
     curve = precision_recall_curve(scores, "cars of a test")
@@ -138,7 +138,7 @@ def labelled(seed: int, cars: int, shape: tuple[int, int]) -> LabelledImage:
 
 
 @given(SEEDS, st.integers(2, 5), st.integers(0, 60), st.sampled_from([(40, 90), (90, 40)]))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_folds_partition_the_image_and_its_cars(seed: int, folds: int, cars: int, shape: tuple[int, int]) -> None:
     sample = labelled(seed, cars, shape)
     regions = [spatial_fold(sample, fold, folds) for fold in range(folds)]

@@ -30,7 +30,7 @@ def test_of_two_detections_of_a_car_the_better_one_stays() -> None:
 
 
 @given(SEEDS, st.integers(1, 60))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_suppression_keeps_some_of_the_rows_the_best_first_and_is_idempotent(seed: int, count: int) -> None:
     cars = crowd(seed, count)
     kept = nms_oriented(cars, LENGTH)
@@ -41,7 +41,7 @@ def test_suppression_keeps_some_of_the_rows_the_best_first_and_is_idempotent(see
 
 
 @given(SEEDS, st.integers(1, 40))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_suppression_does_not_depend_on_the_order_of_rows_or_the_direction_along_the_axis(
     seed: int, count: int
 ) -> None:
@@ -54,7 +54,7 @@ def test_suppression_does_not_depend_on_the_order_of_rows_or_the_direction_along
 
 
 @given(SEEDS, st.integers(1, 40), st.floats(0, 2 * np.pi), st.floats(-50, 50))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_suppression_moves_with_the_image(seed: int, count: int, angle: float, shift: float) -> None:
     cars = crowd(seed, count)
     c, s = np.cos(angle), np.sin(angle)
@@ -66,7 +66,7 @@ def test_suppression_moves_with_the_image(seed: int, count: int, angle: float, s
 
 
 @given(SEEDS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_no_two_kept_centres_lie_within_the_ellipse_of_the_better_one(seed: int) -> None:
     kept = nms_oriented(crowd(seed, 60), LENGTH)
     for j in range(len(kept)):

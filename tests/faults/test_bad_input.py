@@ -40,14 +40,14 @@ def test_mutated_files_of_every_kind_are_read_or_refused(tmp_path: Path) -> None
     assert len(tried) > 15
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(content=st.dictionaries(KEYS, JSON, max_size=4))
 def test_any_structure_as_configuration(content: object, by_name: dict[str, Kind], folder: Path) -> None:
     assert problem_of_case(by_name["configuration"], yaml.safe_dump(content).encode(), folder) == ""
 
 
 @pytest.mark.parametrize("name", ["labels (JSON)", "detector", "flight record"])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(content=JSON)
 def test_any_json(name: str, content: object, by_name: dict[str, Kind], folder: Path) -> None:
     assert problem_of_case(by_name[name], json.dumps(content).encode(), folder) == ""
@@ -67,7 +67,7 @@ CELL = (
 
 
 @pytest.mark.parametrize("name", list(HEADERS))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_any_table(name: str, data: st.DataObject, by_name: dict[str, Kind], folder: Path) -> None:
     """Its columns, some of them twice or missing, and rows of any length with any text."""

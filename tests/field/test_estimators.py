@@ -89,7 +89,7 @@ def test_the_bandwidth_follows_scotts_rule_down_to_its_minimum() -> None:
     assert bandwidth_bins(0) == BANDWIDTH_BINS
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(x=st.floats(-12, 12), y=st.floats(-12, 12), sigma=st.floats(0.6, 2.0))
 def test_mean_shift_finds_the_centre_of_a_gaussian(x: float, y: float, sigma: float) -> None:
     modes = velocity_modes(gaussian_histogram((x, y), sigma)[None, None], np.array([[50]], np.int32), bins=BINS)

@@ -121,7 +121,7 @@ def test_kernel_agrees_with_the_definition(weight: str) -> None:
     np.testing.assert_allclose(fast.variance_sum / VARIANCE_UNIT, variance_sum, atol=1e-3 * count.max())
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_a_track_weighs_one_at_each_pixel(seed: int) -> None:
     """Slow or fast, of one segment or of many: ``histogram.sum((2, 3)) == count * UNIT``."""
@@ -130,7 +130,7 @@ def test_a_track_weighs_one_at_each_pixel(seed: int) -> None:
     np.testing.assert_array_equal(tile.histogram.sum(axis=(2, 3)), tile.count * UNIT)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), radius=st.sampled_from([None, 0.75, 2.0]))
 def test_the_histogram_does_not_depend_on_the_order_of_tracks_nor_on_the_tiling(
     seed: int, radius: float | None
@@ -150,7 +150,7 @@ def test_the_histogram_does_not_depend_on_the_order_of_tracks_nor_on_the_tiling(
     np.testing.assert_array_equal(joined, whole.histogram)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10_000))
 def test_disjoint_sets_of_tracks_add_up_to_the_whole_and_subtract_again(seed: int) -> None:
     segments = tracks(seed, n=10)

@@ -151,7 +151,7 @@ def test_few_of_many_tests_under_the_null_hypothesis_are_significant() -> None:
     assert found[:90_000].sum() < 0.08 * found.sum()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 10_000), n=st.integers(0, 300), scale=st.sampled_from([1.0, 0.1, 0.01]))
 def test_significance_is_benjamini_and_hochbergs_step_up_rule(seed: int, n: int, scale: float) -> None:
     """All p-values up to the largest with p_(k) <= level * k / n; NaN never, and not counted in n."""

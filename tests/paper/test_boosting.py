@@ -129,7 +129,7 @@ def test_quantile_edges_fill_the_bins_evenly() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_random_features_keep_to_their_rules(seed: int, max_rectangles: int) -> None:
     pool = draw_feature_pool(
         8,

@@ -28,7 +28,7 @@ def random_stumps(rounds: int, *, seed: int = 1) -> BoostedStumps:
     return BoostedStumps(pool.table, pool.starts, np.zeros(rounds, np.float32), leaves)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(SEEDS, st.integers(65, 100), st.integers(65, 100), st.integers(1, 30), st.sampled_from([3, 5, 8]))
 def test_the_response_is_that_of_the_sums_of_its_rectangles(
     seed: int, height: int, width: int, rounds: int, bits: int
@@ -60,7 +60,7 @@ def smooth_noise(seed: int, shape: tuple[int, int] = (60, 80), sigma: float = 3.
 
 
 @given(SEEDS, st.floats(-0.5, 1.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_regions_are_those_above_the_threshold_each_grown_from_one_maximum(seed: int, threshold: float) -> None:
     response = smooth_noise(seed)
     smooth, labels = segment_response(response, sigma_px=1.5, threshold=threshold, min_region_px=1)
@@ -81,7 +81,7 @@ def test_regions_are_those_above_the_threshold_each_grown_from_one_maximum(seed:
 
 
 @given(SEEDS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_regions_grow_as_a_watershed_of_the_distance_to_the_seeds(seed: int) -> None:
     """Each pixel of a region is at most as many steps from its own seed, within the mask, as from any other."""
     response = smooth_noise(seed, (40, 50))

@@ -95,14 +95,14 @@ def test_polyprojective_without_bending_is_the_homography() -> None:
     np.testing.assert_allclose(p.homography(), matrix, atol=1e-10)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_polyprojective_inverse_undoes_it(seed: int) -> None:
     p = bent(np.random.default_rng(seed))
     np.testing.assert_allclose(p.inverse(p(grid())), grid(), atol=1e-3)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_to_raw_undoes_to_base_below_a_thousandth_of_a_pixel(seed: int) -> None:
     t = replace(frame_transform(np.random.default_rng(seed)), lens=LENSES[seed % len(LENSES)])
@@ -157,7 +157,7 @@ def test_composition_is_one_map_after_the_other() -> None:
     assert np.abs(both.to_base(back[found]) - there[good][found]).max() < 1e-2
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_a_homography_and_its_inverse_cancel(seed: int) -> None:
     h = HomographyTransform(homography(np.random.default_rng(seed)))
@@ -176,7 +176,7 @@ def test_a_homography_has_no_value_beyond_its_horizon() -> None:
     assert np.isfinite(h(np.array([[99.0, 5.0], [101.0, 5.0]]))).all(axis=1).tolist() == [True, False]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_normalised_points_lie_in_the_unit_square_and_touch_it(seed: int) -> None:
     xy = np.random.default_rng(seed).uniform(-1e4, 1e4, (20, 2))

@@ -45,7 +45,7 @@ def test_to_raw_inverts_to_base(case) -> None:
         assert np.abs(flight.camera.to_raw(frame, base) - xy).max() < 1e-6
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), a=st.floats(-0.3, 0.4), wobble=st.floats(0, 4), tilt=st.floats(0, 4))
 def test_to_raw_inverts_to_base_for_any_camera(seed: int, a: float, wobble: float, tilt: float) -> None:
     camera = CameraSimulation(lens_a=a, vibration_px=wobble, vibration_cycles=6.0, tilt_deg=tilt)

@@ -167,7 +167,7 @@ def test_texture_scales_with_its_strength_and_vegetation_is_lighter_for_the_othe
     assert np.corrcoef(camera[:, :128].ravel(), other[:, :128].ravel())[0, 1] > 0.9  # one ground, two sensors
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1000), lean=st.floats(0.1, 1.5))
 def test_the_reach_map_bounds_all_heights_that_a_ray_may_meet(seed: int, lean: float) -> None:
     rng = np.random.default_rng(seed)
@@ -201,7 +201,7 @@ def test_a_shadow_is_as_long_as_height_times_the_sun_vector(direction: tuple[flo
     )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 1000), height=st.floats(0, 20))
 def test_relief_is_bounded_by_its_height_and_zero_gives_a_plane(seed: int, height: float) -> None:
     relief = make_relief((-64, -64, 500, 400), height_px=height, length_px=300.0, rng=np.random.default_rng(seed))

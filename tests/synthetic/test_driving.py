@@ -81,14 +81,12 @@ def run(network: RoadNetwork, cars: CarStates, seconds: float, config: TrafficSi
     return np.array(log)
 
 
-@settings(deadline=None)
 @given(v=st.floats(0.0, 30.0), desired=st.floats(5.0, 30.0))
 def test_on_a_free_road_acceleration_is_a_times_one_minus_the_fourth_power(v: float, desired: float) -> None:
     expected = ACCELERATION * (1 - (v / desired) ** 4)
     assert idm_acceleration(v, desired, FAR, 0.0, 1.0) == pytest.approx(expected)
 
 
-@settings(deadline=None)
 @given(v=st.floats(0.5, 13.0), headway=st.floats(0.6, 1.6))
 def test_acceleration_is_zero_at_the_equilibrium_gap(v: float, headway: float) -> None:
     """Treiber's equilibrium: (s0 + v T) / sqrt(1 - (v / v0)^4)."""
@@ -106,7 +104,6 @@ def test_braking_is_harder_than_needed_in_an_emergency_and_softer_far_from_it() 
         assert (idm_acceleration(v, 14.0, v * v / (2 * needed), v, 0.0) < -needed) == harder
 
 
-@settings(deadline=None)
 @given(time_s=st.floats(0, 500), offset=st.floats(0, 60), red=st.floats(0.5, 5))
 def test_the_two_groups_of_an_intersection_are_never_green_together(time_s: float, offset: float, red: float) -> None:
     offsets = np.array([offset])
@@ -143,7 +140,7 @@ def test_a_platoon_relaxes_to_the_equilibrium_gap_behind_a_slow_leader() -> None
     assert gaps == pytest.approx([(MIN_GAP + 8.0) / np.sqrt(1 - (8 / 14) ** 4)] * 3, rel=0.02)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1000))
 def test_cars_behind_one_that_brakes_hard_do_not_collide(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -81,7 +81,7 @@ def test_a_lane_is_cut_into_contiguous_edges_at_its_nodes() -> None:
     assert [edge.signal for edge in edges] == [3, -1, -1]  # the stop line is at the end of the edge before the box
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     x=st.floats(4, 40),
     y=st.floats(-40, 40),

@@ -60,7 +60,7 @@ def test_late_frames_have_their_fractions_and_delays(half: float, whole: float) 
     assert np.isclose(steps[:, None], [0.2, 0.3, 0.4]).any(axis=1).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 1000), jitter=st.floats(0, 0.02), fps=st.floats(2, 60))
 def test_times_ascend_for_any_jitter_and_rate(seed: int, jitter: float, fps: float) -> None:
     config = TimesSimulation(fps=fps, jitter_s=jitter)
@@ -77,7 +77,7 @@ def test_jitter_has_its_standard_deviation() -> None:
     assert len(frame_times(config, 1, np.random.default_rng(1))) == 1
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 1000))
 def test_motion_never_exceeds_its_amplitudes_and_is_smooth(seed: int) -> None:
     amplitudes = np.array([8.0, 3.0, 0.0])

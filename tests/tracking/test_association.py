@@ -46,7 +46,7 @@ def test_a_competitor_through_one_detection_halves_the_confidence_and_a_tie_leav
     assert not tied.any()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 10_000), m=st.integers(1, 25))
 def test_the_best_triples_and_confidences_are_those_of_their_definition(seed: int, m: int) -> None:
     rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def test_the_best_triples_and_confidences_are_those_of_their_definition(seed: in
         assert confidence[t] == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 10_000), m=st.integers(1, 20))
 def test_the_cross_check_keeps_links_that_are_each_others_only_best(seed: int, m: int) -> None:
     rng = np.random.default_rng(seed)

@@ -124,7 +124,7 @@ TIMES = [t.time_s for t in SHORT.tables]
 WHOLE = link_windows(SHORT.tables, TrackingConfig(), gsd_m=None, starts=ALL)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.sets(st.integers(1, 11), max_size=8))
 def test_any_chunking_gives_the_same_tracklets(cuts: set[int]) -> None:
     """link(parts, each with the frames of `window_frames`) == link(whole), to the bit, and their logs add up."""
@@ -156,7 +156,7 @@ def test_a_dropped_frame_breaks_by_time_not_by_index() -> None:
     assert log["gaps_too_long"] == 1
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(steps=st.lists(st.sampled_from([0.0, 0.1, 0.2, 0.3]), min_size=2, max_size=5))
 @example(steps=[0.2, 0.0, 0.2])
 def test_an_interval_of_zero_never_divides(steps: list[float]) -> None:

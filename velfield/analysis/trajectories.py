@@ -241,7 +241,8 @@ def _smooth(
         a, b = first[k], first[k + 1]
         driven = np.zeros((b - a + 1, 2))
         for i in range(a, b - 1):
-            driven[i - a + 1] = driven[i - a] + step[i]
+            for axis in range(2):
+                driven[i - a + 1, axis] = driven[i - a, axis] + step[i, axis]
         low = high = a
         for i in range(a, b):
             reach = min(reach_s, max(time_s[i] - time_s[a], 0.0) + 0.25, max(time_s[b - 1] - time_s[i], 0.0) + 0.25)
@@ -263,8 +264,8 @@ def _smooth(
                 low -= 1
             while high < b - 1 and time_s[high + 1] - time_s[i] <= velocity_s:
                 high += 1
-            if high > low:
-                velocity[i] = (driven[high - a] - driven[low - a]) / (time_s[high] - time_s[low])
+            for axis in range(2 if high > low else 0):
+                velocity[i, axis] = (driven[high - a, axis] - driven[low - a, axis]) / (time_s[high] - time_s[low])
     return out, velocity
 
 

@@ -116,7 +116,7 @@ def _find_in_mosaic(
     valid = assemble_kernel(frame.valid.view(np.uint8), corners, placed, *mosaic.shape, False).view(np.bool_)
     found = detector.find_in_crops(image, valid, placed, threshold=threshold)
     searched = np.column_stack([placed[:, :2] + inner[:, :2] - corners, inner[:, 2:] - inner[:, :2]])
-    crop = owners_kernel(found.xy, searched, *mosaic.shape)
+    crop = owners_kernel(np.ascontiguousarray(found.xy), searched, *mosaic.shape)
     inside = np.flatnonzero(crop >= 0)
     found, crop = found.take(inside), crop[inside]
     shift = (corners - placed[:, :2])[crop]

@@ -228,7 +228,7 @@ def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64])
                     if (found[k, 0] - mode_y) ** 2 + (found[k, 1] - mode_x) ** 2 < _SAME_MODE_BINS**2:
                         known = True
                 if not known:
-                    found[n_found] = (mode_y, mode_x, 0.0)
+                    found[n_found, 0], found[n_found, 1], found[n_found, 2] = mode_y, mode_x, 0.0
                     n_found += 1
     total = 0.0
     for y in range(top, bottom):
@@ -245,8 +245,8 @@ def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64])
     order = np.argsort(-found[:n_found, 2], kind="mergesort")
     kept = min(n_found, modes.shape[0])
     for k in range(kept):
-        modes[k] = found[order[k]]
-        modes[k, 2] /= total
+        y, x, weight = found[order[k]]
+        modes[k, 0], modes[k, 1], modes[k, 2] = y, x, weight / total
     return int(kept)
 
 

@@ -327,7 +327,23 @@ def add_folds(parts: FloatArray, leave_out: bool, systems: FloatArray, begin: in
 @kernel
 def _interleave(theta: FloatArray) -> FloatArray:
     """Row coefficients (3 knots,), those of each knot next to each other, of parameters (17 + 3 knots,)."""
-    return theta[17:].reshape((3, (len(theta) - 17) // 3)).T.copy().ravel()
+    out = np.empty(len(theta) - 17)
+    for k in range(len(out)):
+        out[k] = theta[_parameter(k, len(out))]
+    return out
+
+
+@kernel
+def _parameter(k: int, count: int) -> int:
+    """Number among the parameters of the k-th of so many interleaved row coefficients."""
+    return 17 + k % 3 * (count // 3) + k // 3
+
+
+@kernel
+def _add(to: FloatArray, value: float) -> None:
+    """Add a value to each of eight systems; numba compiles what assigns an array to a part of another for seconds."""
+    for lane in range(LANES):
+        to[lane] += value
 
 
 @kernel
@@ -340,18 +356,18 @@ def _make_priors(
     corner = aligned_zeros(directions + 18, directions + 18, LANES)
     for i in range(size):
         for d in range(min(3, (size - i + 2) // 3)):
-            bands[i, 3 * d] = stiffness[i, d]
-            border[i, -1] -= stiffness[i, d] * rows[i + 3 * d]
+            _add(bands[i, 3 * d], stiffness[i, d])
+            _add(border[i, -1], -stiffness[i, d] * rows[i + 3 * d])
             if d > 0:
-                border[i + 3 * d, -1] -= stiffness[i, d] * rows[i]
+                _add(border[i + 3 * d, -1], -stiffness[i, d] * rows[i])
         for k in range(directions):
-            border[i, k] = gauge[i, k]
-            corner[k, -1] -= gauge[i, k] * rows[i]
+            _add(border[i, k], gauge[i, k])
+            _add(corner[k, -1], -gauge[i, k] * rows[i])
     for k in range(directions):
-        corner[k, k] = -1.0 / gauge_weight
+        _add(corner[k, k], -1.0 / gauge_weight)
     for k in range(17):
-        corner[directions + k, directions + k] = prior[k]
-        corner[directions + k, -1] = -prior[k] * theta[k]
+        _add(corner[directions + k, directions + k], prior[k])
+        _add(corner[directions + k, -1], -prior[k] * theta[k])
     return bands, border, corner
 
 
@@ -392,8 +408,10 @@ def solve_steps(bands, border, corner, stiffness, gauge, gauge_weight, prior, fr
     for f in range(len(steps)):
         definite = (matrix[:, 0, f] > 0.0).all() and (dense[directions:, 0, f] > 0.0).all()
         if definite and (dense[:directions, 0, f] < 0.0).all():
-            steps[f, :17] = known[directions:, 0, f]
-            steps[f, 17:] = rows[:, 0, f].copy().reshape((-1, 3)).T.copy().ravel()
+            for k in range(17):
+                steps[f, k] = known[directions + k, 0, f]
+            for k in range(len(rows)):
+                steps[f, _parameter(k, len(rows))] = rows[k, 0, f]
     return steps
 
 
@@ -404,7 +422,10 @@ def _solve_dense(systems: FloatArray) -> tuple[FloatArray, FloatArray]:
     count = systems.shape[0] - 1
     bands, right = aligned_zeros(count, count, LANES), aligned_zeros(count, 1, LANES)
     for k in range(count):
-        bands[k, : count - k], right[k, 0] = systems[k, k:count], systems[k, count]
+        for lane in range(LANES):
+            for d in range(count - k):
+                bands[k, d, lane] = systems[k, k + d, lane]
+            right[k, 0, lane] = systems[k, count, lane]
     nothing = np.zeros((0, 1, LANES))
     eliminate_bands(bands, right, nothing)
     return bands, substitute_back(bands, right, nothing)
@@ -416,7 +437,9 @@ def predict_squares(bands: FloatArray, border: FloatArray, corner: FloatArray, s
     size, total, inner = bands.shape[1], 0.0, np.empty(18)
     for f in range(len(steps)):
         moved = _interleave(steps[f])
-        inner[:17], inner[17] = steps[f, :17], -1.0
+        for k in range(17):
+            inner[k] = steps[f, k]
+        inner[17] = -1.0
         for i in range(size):
             value = bands[f, i, 0] * moved[i]
             for d in range(1, min(12, size - i)):

@@ -182,7 +182,8 @@ def solve_without_folds(normal: FloatArray, right: FloatArray, smoothness: Float
     found = fit_kernels.substitute_back(bands, sides, nothing)
     meshes = np.empty((folds + 1, count, 2))
     for f in range(folds + 1):
-        meshes[f] = found[:, :, f]
+        for i in range(count):
+            meshes[f, i, 0], meshes[f, i, 1] = found[i, 0, f], found[i, 1, f]
     return meshes
 
 

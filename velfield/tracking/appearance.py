@@ -216,7 +216,9 @@ def _prepare(crops: ByteArray, axes: FloatArray, parts: ByteArray) -> IntArray:
     grey, lowest, highest, out = crops.reshape(-1), low.reshape(-1), high.reshape(-1), parts.reshape(-1)
     for k in range(n):
         cos, sin = np.cos(axes[k]), np.sin(axes[k])
-        low[:], high[:] = crops[k], crops[k]
+        for y in range(side):
+            for x in range(side):
+                low[y, x] = high[y, x] = crops[k, y, x]
         for y in range(1, side - 1):
             above, line, under = crops[k, y - 1], crops[k, y], crops[k, y + 1]
             low_line, high_line = low[y], high[y]

@@ -228,7 +228,8 @@ def _blur(crop: ByteArray, taps: Float32Array, rows: Float32Array, out: Float32A
             for x in range(np.uint64(side)):
                 into[x] += tap * part[x]
     for y in range(radius):
-        rows[y], rows[side + radius + y] = rows[radius], rows[side + radius - 1]
+        for x in range(side):
+            rows[y, x], rows[side + radius + y, x] = rows[radius, x], rows[side + radius - 1, x]
     for y in range(side):
         into = out[y]
         into[:] = 0.0

@@ -185,6 +185,7 @@ def _place_kernel(
     for n in range(len(corners)):
         top, left = corners[n]
         for row in range(height):
-            probability[top + row, left : left + width] = heatmaps[n, row]
-            for k in range(2):
-                orientation[k, top + row, left : left + width] = vectors[n, k, row]
+            for x in range(width):  # one by one: numba compiles an assigned slice for seconds
+                probability[top + row, left + x] = heatmaps[n, row, x]
+                orientation[0, top + row, left + x] = vectors[n, 0, row, x]
+                orientation[1, top + row, left + x] = vectors[n, 1, row, x]
