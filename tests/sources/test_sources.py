@@ -1,5 +1,7 @@
 """Videos and image folders: the frames and times that went in come out, whatever the container does to them."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 
@@ -81,6 +83,60 @@ def test_a_flight_read_in_pieces_equals_the_whole(tmp_path, frames, suffix, opti
         for piece in pieces:
             assert piece.flags == whole[piece.source_index].flags
             assert np.array_equal(piece.grey, whole[piece.source_index].grey)
+
+
+def in_pieces(indices):
+    """Pieces of eight, as units read them: each with the frame before, and the frames that others will read."""
+    for first in range(0, len(indices), 8):
+        yield {
+            "indices": indices[first : first + 8],
+            "after": indices[first - 1] if first else None,
+            "then": indices[first + 8 :],
+        }
+
+
+def test_pieces_far_behind_a_key_frame_are_read_by_one_decoder(tmp_path):
+    path = write_video(tmp_path / "long.mp4", list(drifting(150)), key_interval=150)
+    info, indices = probe(path, frames=ALL), np.arange(0, 150, 3)
+    whole = list(iter_frames(path, info, indices))
+    parts = in_pieces(indices)
+    read = [frame for _ in range(2) for frame in iter_frames(path, info, **next(parts))]
+    # of a file that nobody could open any more; what is behind the key frame is there
+    state, content = path.stat(), bytearray(path.read_bytes())
+    content[:400] = bytes(400)
+    path.write_bytes(content)
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+    read += [frame for part in parts for frame in iter_frames(path, info, **part)]
+    assert [frame.source_index for frame in read] == indices.tolist()
+    assert all(np.array_equal(a.grey, b.grey) and a.flags == b.flags for a, b in zip(read, whole, strict=True))
+
+
+@pytest.mark.parametrize("key_interval", [10, 60, 150])
+def test_pieces_read_by_several_threads_equal_the_whole(tmp_path, key_interval):
+    path = write_video(tmp_path / "long.mp4", list(drifting(150)), key_interval=key_interval)
+    info, indices = probe(path, frames=ALL), np.arange(0, 150, 2)
+    whole = list(iter_frames(path, info, indices))
+    with ThreadPoolExecutor(3) as pool:
+        pieces = list(pool.map(lambda part: list(iter_frames(path, info, **part)), in_pieces(indices)))
+    read = [frame for piece in pieces for frame in piece]
+    assert [frame.source_index for frame in read] == indices.tolist()
+    assert all(np.array_equal(a.grey, b.grey) and a.flags == b.flags for a, b in zip(read, whole, strict=True))
+
+
+def test_a_piece_that_is_given_up_lets_the_next_one_begin(tmp_path):
+    path = write_video(tmp_path / "long.mp4", list(drifting(100)), key_interval=100)
+    info, indices = probe(path, frames=ALL), np.arange(0, 100, 2)
+    first, second, *_ = in_pieces(np.arange(40, 100))
+    given_up = iter_frames(path, info, **first)
+    next(given_up)
+    with ThreadPoolExecutor(1) as pool:
+        waits = pool.submit(lambda: list(iter_frames(path, info, **second)))
+        given_up.close()
+        read = waits.result(timeout=60)
+    assert [frame.source_index for frame in read] == list(range(48, 56))
+    # and another choice of frames does not get the decoder that waits behind these
+    other = list(iter_frames(path, info, indices[28:34], after=int(indices[27])))
+    assert [frame.source_index for frame in other] == indices[28:34].tolist()
 
 
 def test_limited_range_video_comes_out_in_the_full_range(tmp_path):

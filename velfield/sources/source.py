@@ -77,7 +77,12 @@ def check_source(path: Path | str) -> None:
 
 
 def iter_frames(
-    path: Path | str, info: SourceInfo, indices: Sequence[int] | IntArray, *, after: int | None = None
+    path: Path | str,
+    info: SourceInfo,
+    indices: Sequence[int] | IntArray,
+    *,
+    after: int | None = None,
+    then: Sequence[int] | IntArray = (),
 ) -> Iterator[SourceFrame]:
     """Read frames, in order; one frame for each index, defective ones with flags.
 
@@ -93,6 +98,8 @@ def iter_frames(
     after
         The frame processed just before the first of `indices`, if any: it is read for comparison only, so
         that a flight cut into units flags the same frames as an uncut one.
+    then
+        Ascending indices behind them that later calls ask for: a decoder goes on from one call to the next.
 
     Raises
     ------
@@ -106,14 +113,19 @@ def iter_frames(
     if requested[0] < 0 or requested[-1] >= info.frame_count or np.any(np.diff(requested) <= 0):
         raise ValueError(f"indices must ascend within 0 to {info.frame_count - 1}")
     read = requested if after is None else np.r_[np.int64(after), requested]
-    reader = iter_video if info.kind == "video" else iter_folder
     previous: SourceFrame | None = None
-    for frame in iter_clips(info, read) if info.parts else reader(source, info, read):
+    for frame in _read(source, info, read, np.asarray(then, np.int64)):
         checked = _with_content_flags(frame, previous)
         if not checked.flags & FrameFlag.UNREADABLE:
             previous = checked
         if checked.source_index != after:
             yield checked
+
+
+def _read(source: Path, info: SourceInfo, indices: IntArray, then: IntArray) -> Iterator[SourceFrame]:
+    if info.parts:
+        return iter_clips(info, indices, then)
+    return iter_video(source, info, indices, then) if info.kind == "video" else iter_folder(source, info, indices)
 
 
 def _with_content_flags(frame: SourceFrame, previous: SourceFrame | None) -> SourceFrame:

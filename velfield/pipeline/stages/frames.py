@@ -132,7 +132,8 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
     thumbnails = np.zeros((len(frames), *THUMBNAIL_SHAPE), np.float32)
     warnings = []
     source = Path(plan.job.inputs.source)
-    for k, found in enumerate(iter_frames(source, plan.info, indices, after=before)):
+    then = plan.indices[frames.stop :]
+    for k, found in enumerate(iter_frames(source, plan.info, indices, after=before, then=then)):
         store.write(frames[k], found.grey)
         flags[k] = found.flags
         if found.reason:

@@ -34,6 +34,7 @@ from velfield.sources.video.corruption import (
     libav_log,
 )
 from velfield.sources.video.packets import iter_packets, open_video, video_stream
+from velfield.sources.video.pauses import Pause, Pauses, file_state
 
 _GREY_16, _SAMPLED = "gray16le", 16
 _LUMA_FIRST = {"gray", "yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21"}
@@ -45,25 +46,64 @@ _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _INTRA = 1  # AV_PICTURE_TYPE_I
 _HELD_FRAMES = 4 * MARGIN
 """A frame is delivered once so many later ones, more than any reordering and the margin of an error, are decoded."""
+_FAR_FRAMES = 30
+"""A second of most videos: cameras write key frames so often, programs that cut and convert every ten."""
+_NONE: IntArray = np.empty(0, np.int64)
+_pauses = Pauses()
 _Decoded = tuple[int, GreyImage | None, bool]
 """A frame's index, its image (None: not decoded), whether it is known to be suspect."""
 _LIMITED_TO_FULL = np.clip(np.round((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 
 
-def iter_video(path: Path, info: SourceInfo, indices: IntArray) -> Iterator[SourceFrame]:
-    """Decode the frames `indices` in sequence; one that is not decoded is yielded with the flag UNREADABLE."""
+def iter_video(path: Path, info: SourceInfo, indices: IntArray, then: IntArray = _NONE) -> Iterator[SourceFrame]:
+    """Decode the frames `indices` in sequence; one that is not decoded is yielded with the flag UNREADABLE.
+
+    ``then``: the frames that other calls will ask for; the next one, which begins with the last of these, goes on with
+    the decoder where that saves much.
+    """
     delivered = 0
-    with libav_log():
-        if info.pts.size and info.key_frames.size:
-            for frame in _read_sound(path, info, indices):
-                yield frame
-                delivered += 1
-        if delivered < indices.size:
+    if info.pts.size and info.key_frames.size:
+        for frame in _read_on(path, info, indices, then):
+            yield frame
+            delivered += 1
+    if delivered < indices.size:
+        with libav_log():
             yield from _read_with_care(path, info, indices[delivered:])
 
 
-def _read_sound(path: Path, info: SourceInfo, indices: IntArray) -> Iterator[SourceFrame]:
+def _read_on(path: Path, info: SourceInfo, indices: IntArray, then: IntArray) -> Iterator[SourceFrame]:
+    """`_read_sound` by a decoder that waits at the first frame, if there is one; it waits at the last, if that pays."""
+    file, asked, last = file_state(path), np.concatenate([indices, then]), int(indices[-1])
+    pause = _pauses.take(file, asked) if _is_far(info, int(asked[0])) else None
+    frames = _read_sound(path, info, asked) if pause is None else pause.frames
+    waits, left = then.size > 0 and _is_far(info, last), None
+    if waits:
+        _pauses.announce(file, last)
+    try:
+        for frame in itertools.chain([] if pause is None else [pause.last], frames):
+            yield frame
+            if frame.source_index == last:
+                left = Pause(file, frame, then, frames) if waits else None
+                break
+    finally:
+        if waits:
+            _pauses.end(file, last, left)
+        if left is None:
+            frames.close()
+
+
+def _is_far(info: SourceInfo, index: int) -> bool:
+    """Whether a decoder that begins at the key frame before a frame decodes so many for nothing that waiting pays."""
+    return index - int(np.flatnonzero(info.key_frames[: index + 1])[-1:].sum()) > _FAR_FRAMES
+
+
+def _read_sound(path: Path, info: SourceInfo, indices: IntArray) -> Generator[SourceFrame, None, None]:
     """The frames `indices` until the first sign of damage; all of them in a sound stream."""
+    with libav_log():
+        yield from _read_logged(path, info, indices)
+
+
+def _read_logged(path: Path, info: SourceInfo, indices: IntArray) -> Iterator[SourceFrame]:
     for entry in _entry_points(info, int(indices[0])):
         errors, waiting, position, held = count_errors(), 0, 0, deque[tuple[int, GreyImage]]()
         for index, frame in _decode_on_threads(path, info, entry, indices):
