@@ -4,8 +4,9 @@ The steps of long work that nothing else counts: those of a training, whatever t
 """
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Lock
 from typing import TypeVar
@@ -22,6 +23,18 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T], *, at_most: int
     """
     with ThreadPoolExecutor(min(usable_processors(), at_most or usable_processors())) as pool:
         return list(pool.map(function, items))
+
+
+def for_each_behind(function: Callable[[T], object], items: Iterable[T]) -> None:
+    """Apply ``function`` to every item, in order, on another thread, while the next two items are made."""
+    with ThreadPoolExecutor(1) as pool:
+        behind = deque[Future[object]]()
+        for item in items:
+            behind.append(pool.submit(function, item))
+            if len(behind) > 2:
+                behind.popleft().result()
+        for last in behind:
+            last.result()
 
 
 def once(function: Callable[[], R]) -> Callable[[], R]:

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from schemas.arrays import IntArray
 from velfield.errors import InputError
+from velfield.parallel import for_each_behind
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, is_cut_as, open_frames
 from velfield.sources.frame_measures import frame_quality
+from velfield.sources.frames import SourceFrame
 from velfield.sources.quality import (
     UNUSABLE,
     FrameFlag,
@@ -131,9 +133,9 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
     sharpness, brightness = np.full(len(frames), np.nan, np.float32), np.full(len(frames), np.nan, np.float32)
     thumbnails = np.zeros((len(frames), *THUMBNAIL_SHAPE), np.float32)
     warnings = []
-    source = Path(plan.job.inputs.source)
-    then = plan.indices[frames.stop :]
-    for k, found in enumerate(iter_frames(source, plan.info, indices, after=before, then=then)):
+
+    def keep(numbered: tuple[int, SourceFrame]) -> None:
+        k, found = numbered
         store.write(frames[k], found.grey)
         flags[k] = found.flags
         if found.reason:
@@ -142,6 +144,9 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
             quality = frame_quality(found.grey)
             sharpness[k], brightness[k], thumbnails[k] = quality.sharpness, quality.brightness, quality.thumbnail
         advance("frames")
+
+    source, then = Path(plan.job.inputs.source), plan.indices[frames.stop :]
+    for_each_behind(keep, enumerate(iter_frames(source, plan.info, indices, after=before, then=then)))
     times_s = plan.info.times_s[indices]
     columns: dict[str, NDArray[Any]] = {
         "time_s": times_s,
