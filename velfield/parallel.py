@@ -26,15 +26,18 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T], *, at_most: int
 
 
 def for_each_behind(function: Callable[[T], object], items: Iterable[T]) -> None:
-    """Apply ``function`` to every item, in order, on another thread, while the next two items are made."""
+    """Apply ``function`` to every item, in order, on another thread, while the next are made: at most two wait."""
     with ThreadPoolExecutor(1) as pool:
         behind = deque[Future[object]]()
-        for item in items:
-            behind.append(pool.submit(function, item))
-            if len(behind) > 2:
-                behind.popleft().result()
-        for last in behind:
-            last.result()
+        try:
+            for item in items:
+                behind.append(pool.submit(function, item))
+                if len(behind) > 2:
+                    behind.popleft().result()
+            for last in behind:
+                last.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def once(function: Callable[[], R]) -> Callable[[], R]:

@@ -164,7 +164,7 @@ def _queues(signal: JunctionSignal, truth: Truth) -> Iterator[Statement]:
 
 
 def queue_pairs(signal: JunctionSignal, truth: Truth) -> Iterator[tuple[Estimate, int]]:
-    """Queues that were found at the onsets of green, and the vehicles that stood there: of the whole flight."""
+    """Queues that were found at the onsets of green, and the vehicles that stood there: of the scene."""
     scene = truth.scene
     for stream in signal.streams:
         true = observe_stream(stream.stream.approach, scene.samples, scene.stops, scene.trajectories.length_m)

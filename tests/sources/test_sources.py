@@ -1,7 +1,9 @@
 """Videos and image folders: the frames and times that went in come out, whatever the container does to them."""
 
 import os
+import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,8 +17,11 @@ from PIL import Image
 from schemas.flight import FramesConfig
 from tests.media import drifting, write_images, write_times, write_video
 from velfield.errors import InputError
+from velfield.parallel import for_each_behind
+from velfield.sources.frames import SourceFrame
 from velfield.sources.quality import FrameFlag
 from velfield.sources.source import iter_frames, probe, select_frames
+from velfield.sources.video import pauses
 
 ALL = FramesConfig()
 
@@ -125,18 +130,60 @@ def test_pieces_read_by_several_threads_equal_the_whole(tmp_path, key_interval):
 
 def test_a_piece_that_is_given_up_lets_the_next_one_begin(tmp_path):
     path = write_video(tmp_path / "long.mp4", list(drifting(100)), key_interval=100)
-    info, indices = probe(path, frames=ALL), np.arange(0, 100, 2)
+    info = probe(path, frames=ALL)
     first, second, *_ = in_pieces(np.arange(40, 100))
     given_up = iter_frames(path, info, **first)
     next(given_up)
     with ThreadPoolExecutor(1) as pool:
         waits = pool.submit(lambda: list(iter_frames(path, info, **second)))
+        time.sleep(0.5)
+        assert not waits.done()
         given_up.close()
         read = waits.result(timeout=60)
     assert [frame.source_index for frame in read] == list(range(48, 56))
     # and another choice of frames does not get the decoder that waits behind these
-    other = list(iter_frames(path, info, indices[28:34], after=int(indices[27])))
-    assert [frame.source_index for frame in other] == indices[28:34].tolist()
+    other = list(iter_frames(path, info, np.arange(56, 66, 2), after=55))
+    assert [frame.source_index for frame in other] == list(range(56, 66, 2))
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_a_decoder_that_nobody_takes_is_closed(monkeypatch, taken):
+    monkeypatch.setattr(pauses, "_KEPT_S", 0.2)
+    closed = []
+
+    def decode():
+        try:
+            yield from range(10)
+        finally:
+            closed.append(True)
+
+    decoder, file = decode(), (Path("a.mp4"), 1, 1)
+    next(decoder)
+    last = SourceFrame(5, "5", 0.2, np.zeros((2, 2), np.uint8), 0, "")
+    waiting = pauses.Pauses()
+    waiting.announce(file, 5)
+    waiting.end(file, 5, pauses.Pause(file, last, np.array([7, 9]), decoder))
+    assert waiting.take(file, np.array([5, 8, 9])) is None
+    assert (waiting.take(file, np.array([5, 7, 9])) is not None) if taken else True
+    time.sleep(1.0)
+    assert closed == ([] if taken else [True])
+    assert waiting.take(file, np.array([5, 7, 9])) is None
+
+
+def test_frames_that_cannot_be_kept_leave_the_next_piece_to_others(tmp_path):
+    path = write_video(tmp_path / "long.mp4", list(drifting(100)), key_interval=100)
+    info = probe(path, frames=ALL)
+    first, second, *_ = in_pieces(np.arange(40, 100))
+
+    def fail(_frame):
+        raise OSError("No space left on device")
+
+    with pytest.raises(OSError, match="No space") as error, closing(iter_frames(path, info, **first)) as read:
+        for_each_behind(fail, read)
+    assert error.value.__traceback__ is not None  # which holds all that was under way
+    with ThreadPoolExecutor(1) as pool:
+        later = pool.submit(lambda: list(iter_frames(path, info, **second))).result(timeout=60)
+    assert [frame.source_index for frame in later] == list(range(48, 56))
 
 
 def test_limited_range_video_comes_out_in_the_full_range(tmp_path):

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.signals.cycles import JunctionSignal, Queue, queues
@@ -175,12 +177,11 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
 def _conflicts(analysis: TrafficAnalysis) -> Answer:
     likely = [c for c in analysis.conflicts if c.likely]
     kinds = ", ".join(f"{sum(c.kind == k for c in likely)} {k}" for k in sorted({c.kind for c in likely}))
-    unclear = sum(c.near for c in analysis.conflicts) - len(likely)
+    unclear = sum(c.on_unclear_levels for c in analysis.conflicts)
     if unclear and not likely:
         text = f"{count_text(unclear, 'pair')} below 1.5 s where it is not clear that the roads are on one level"
         return Answer("conflicts", "", "too little data", f"too little data: {text}")
-    possible = [c for c in analysis.conflicts if not c.near]
-    if not likely and sum(c.probability for c in possible) >= 1.0:
+    if not likely and np.prod([1.0 - c.probability for c in analysis.conflicts]) < 0.5:
         text = "pairs may have been less than 1.5 s apart, which positions with such errors do not settle"
         return Answer("conflicts", "", "too little data", f"too little data: {text}")
     return _events(

@@ -5,7 +5,8 @@ start is by the drone's telemetry where all clips have some, else by the contain
 follow each other in the order given.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -163,15 +164,17 @@ def creation_clock(clip: Path, _info: SourceInfo) -> float | None:
     return moment.timestamp() if moment.year > 1990 else None  # 1904 or 1970: a clock that was never set
 
 
-def iter_clips(info: SourceInfo, indices: IntArray, then: IntArray) -> Iterator[SourceFrame]:
+def iter_clips(info: SourceInfo, indices: IntArray, then: IntArray) -> Generator[SourceFrame, None, None]:
     """Frames of all clips, by their indices in the joined source; ``then``: those that later calls ask for."""
     first = 0
     for path, part, start_s in info.parts:
         mine, later = (some[(some >= first) & (some < first + part.frame_count)] - first for some in (indices, then))
         shift_s = start_s - float(part.times_s[0])
-        for frame in iter_video(Path(path), part, mine, later) if len(mine) else ():
-            index = frame.source_index + first
-            yield replace(frame, source_index=index, name=info.names[index], time_s=frame.time_s + shift_s)
+        if len(mine):
+            with closing(iter_video(Path(path), part, mine, later)) as frames:
+                for frame in frames:
+                    index = frame.source_index + first
+                    yield replace(frame, source_index=index, name=info.names[index], time_s=frame.time_s + shift_s)
         first += part.frame_count
 
 

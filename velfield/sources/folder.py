@@ -1,7 +1,7 @@
 """A folder of images as a source: natural order, times from a CSV or from a frame rate that the user gives."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +82,7 @@ def list_images(path: Path) -> tuple[str, ...]:
     return tuple(sorted(names, key=natural_key))
 
 
-def iter_folder(path: Path, info: SourceInfo, indices: IntArray) -> Iterator[SourceFrame]:
+def iter_folder(path: Path, info: SourceInfo, indices: IntArray) -> Generator[SourceFrame, None, None]:
     """Read the images `indices`; one that cannot be read is yielded with the flag UNREADABLE."""
     for index in indices:
         yield _read(path, info, int(index))

@@ -1,6 +1,7 @@
 """One interface to videos and image folders: `probe` it, choose frames (`select_frames`), read them (`iter_frames`)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def iter_frames(
     *,
     after: int | None = None,
     then: Sequence[int] | IntArray = (),
-) -> Iterator[SourceFrame]:
+) -> Generator[SourceFrame, None, None]:
     """Read frames, in order; one frame for each index, defective ones with flags.
 
     A video is decoded in sequence from the key frame before the first index (seeking to a frame number lands
@@ -99,7 +100,8 @@ def iter_frames(
         The frame processed just before the first of `indices`, if any: it is read for comparison only, so
         that a flight cut into units flags the same frames as an uncut one.
     then
-        Ascending indices behind them that later calls ask for: a decoder goes on from one call to the next.
+        Ascending indices behind them that later calls ask for: a decoder goes on from one call to the next. Then a
+        call is read to its end, or closed, before the same thread begins the next one.
 
     Raises
     ------
@@ -114,15 +116,16 @@ def iter_frames(
         raise ValueError(f"indices must ascend within 0 to {info.frame_count - 1}")
     read = requested if after is None else np.r_[np.int64(after), requested]
     previous: SourceFrame | None = None
-    for frame in _read(source, info, read, np.asarray(then, np.int64)):
-        checked = _with_content_flags(frame, previous)
-        if not checked.flags & FrameFlag.UNREADABLE:
-            previous = checked
-        if checked.source_index != after:
-            yield checked
+    with closing(_read(source, info, read, np.asarray(then, np.int64))) as frames:
+        for frame in frames:
+            checked = _with_content_flags(frame, previous)
+            if not checked.flags & FrameFlag.UNREADABLE:
+                previous = checked
+            if checked.source_index != after:
+                yield checked
 
 
-def _read(source: Path, info: SourceInfo, indices: IntArray, then: IntArray) -> Iterator[SourceFrame]:
+def _read(source: Path, info: SourceInfo, indices: IntArray, then: IntArray) -> Generator[SourceFrame, None, None]:
     if info.parts:
         return iter_clips(info, indices, then)
     return iter_video(source, info, indices, then) if info.kind == "video" else iter_folder(source, info, indices)

@@ -85,12 +85,12 @@ class Conflict:
     @property
     def likely(self) -> bool:
         """Whether it is a conflict with a probability of `LIKELY` or more, of roads that are clearly on one level."""
-        return self.on_one_level and self.near
+        return self.on_one_level and self.probability >= LIKELY
 
     @property
-    def near(self) -> bool:
-        """Whether it would be likely if the roads were on one level."""
-        return self.probability >= LIKELY * self.one_level
+    def on_unclear_levels(self) -> bool:
+        """Whether it would be likely if the roads were on one level, of which it is not clear that they are."""
+        return not self.on_one_level and self.probability >= LIKELY * self.one_level
 
 
 def find_conflicts(

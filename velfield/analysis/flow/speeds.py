@@ -26,7 +26,7 @@ _FREE_HEADWAY_S = 4.0
 """A vehicle whose leader is further ahead follows nobody."""
 _UNSEEN_HEADWAY_S, _ALIKE = 8.0, 0.03
 """One whose leader is nearer than this, and as fast but for this fraction, may follow another that was not seen: it
-counts neither as free nor as following."""
+does not count as free."""
 _FOLLOWS_HEADWAY_S = (2.0, 3.0)
 """One whose leader is nearer goes no faster than it would like: from which headway on is not known better than this."""
 _STEADY_M, _STEADY = 30.0, 0.03

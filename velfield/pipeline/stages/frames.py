@@ -6,6 +6,7 @@ Both are defined by the frames around them, so they are detected over the whole 
 however the flight is cut into units. Frames with another defect are neither tested nor anybody's neighbours.
 """
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -146,7 +147,8 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
         advance("frames")
 
     source, then = Path(plan.job.inputs.source), plan.indices[frames.stop :]
-    for_each_behind(keep, enumerate(iter_frames(source, plan.info, indices, after=before, then=then)))
+    with closing(iter_frames(source, plan.info, indices, after=before, then=then)) as read:
+        for_each_behind(keep, enumerate(read))
     times_s = plan.info.times_s[indices]
     columns: dict[str, NDArray[Any]] = {
         "time_s": times_s,

@@ -11,7 +11,7 @@ import itertools
 import re
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,8 @@ _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _INTRA = 1  # AV_PICTURE_TYPE_I
 _HELD_FRAMES = 4 * MARGIN
 """A frame is delivered once so many later ones, more than any reordering and the margin of an error, are decoded."""
-_FAR_FRAMES = 30
-"""A second of most videos: cameras write key frames so often, programs that cut and convert every ten."""
+_FAR = 0.25
+"""Frames decoded for nothing, as a fraction of a part's own, from which on parts share a decoder."""
 _NONE: IntArray = np.empty(0, np.int64)
 _pauses = Pauses()
 _Decoded = tuple[int, GreyImage | None, bool]
@@ -55,7 +55,9 @@ _Decoded = tuple[int, GreyImage | None, bool]
 _LIMITED_TO_FULL = np.clip(np.round((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 
 
-def iter_video(path: Path, info: SourceInfo, indices: IntArray, then: IntArray = _NONE) -> Iterator[SourceFrame]:
+def iter_video(
+    path: Path, info: SourceInfo, indices: IntArray, then: IntArray = _NONE
+) -> Generator[SourceFrame, None, None]:
     """Decode the frames `indices` in sequence; one that is not decoded is yielded with the flag UNREADABLE.
 
     ``then``: the frames that other calls will ask for; the next one, which begins with the last of these, goes on with
@@ -63,38 +65,43 @@ def iter_video(path: Path, info: SourceInfo, indices: IntArray, then: IntArray =
     """
     delivered = 0
     if info.pts.size and info.key_frames.size:
-        for frame in _read_on(path, info, indices, then):
-            yield frame
-            delivered += 1
+        with closing(_read_on(path, info, indices, then)) as frames:
+            for frame in frames:
+                yield frame
+                delivered += 1
     if delivered < indices.size:
         with libav_log():
             yield from _read_with_care(path, info, indices[delivered:])
 
 
-def _read_on(path: Path, info: SourceInfo, indices: IntArray, then: IntArray) -> Iterator[SourceFrame]:
+def _read_on(path: Path, info: SourceInfo, indices: IntArray, then: IntArray) -> Generator[SourceFrame, None, None]:
     """`_read_sound` by a decoder that waits at the first frame, if there is one; it waits at the last, if that pays."""
-    file, asked, last = file_state(path), np.concatenate([indices, then]), int(indices[-1])
-    pause = _pauses.take(file, asked) if _is_far(info, int(asked[0])) else None
-    frames = _read_sound(path, info, asked) if pause is None else pause.frames
-    waits, left = then.size > 0 and _is_far(info, last), None
-    if waits:
+    first, last, asked = int(indices[0]), int(indices[-1]), np.concatenate([indices, then])
+    file = file_state(path) if usable_processors() <= _MOST_THREADS else None  # more decode several parts at once
+    begins, waits = _is_far(info, first, last), then.size > 0 and last > first and _is_far(info, last, 2 * last - first)
+    if file is not None and waits:
         _pauses.announce(file, last)
+    pause = taken = None
+    frames: Generator[SourceFrame, None, None] | None = None
     try:
-        for frame in itertools.chain([] if pause is None else [pause.last], frames):
+        taken = _pauses.take(file, asked) if file is not None and begins else None
+        frames = _read_sound(path, info, asked) if taken is None else taken.frames
+        for frame in itertools.chain([] if taken is None else [taken.last], frames):
             yield frame
             if frame.source_index == last:
-                left = Pause(file, frame, then, frames) if waits else None
+                pause = Pause(file, frame, then, frames) if file is not None and waits else None
                 break
     finally:
-        if waits:
-            _pauses.end(file, last, left)
-        if left is None:
+        if file is not None and waits:
+            _pauses.end(file, last, pause)
+        if frames is not None and pause is None:
             frames.close()
 
 
-def _is_far(info: SourceInfo, index: int) -> bool:
-    """Whether a decoder that begins at the key frame before a frame decodes so many for nothing that waiting pays."""
-    return index - int(np.flatnonzero(info.key_frames[: index + 1])[-1:].sum()) > _FAR_FRAMES
+def _is_far(info: SourceInfo, first: int, last: int) -> bool:
+    """Whether a decoder that begins at the key frame before a part decodes much for nothing, beside the part itself."""
+    key = int(np.flatnonzero(info.key_frames[: first + 1])[-1:].sum())
+    return first - key > _FAR * (last - first)
 
 
 def _read_sound(path: Path, info: SourceInfo, indices: IntArray) -> Generator[SourceFrame, None, None]:

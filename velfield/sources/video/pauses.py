@@ -1,8 +1,8 @@
 """Decoders that wait where one part of a flight ends, for the part that begins there.
 
-A part is decoded from the key frame before it on: where these are ten seconds apart, more would be decoded twice than
-once. So the parts that a process reads one after the other share a decoder, and a part whose beginning is being reached
-by another waits for it: libav's threads use the processors meanwhile.
+A part is decoded from the key frame before it on: where these are ten seconds apart, as programs that cut and convert
+write them, most frames would be decoded twice or more. So parts that a process reads one after the other share a
+decoder, and a part whose beginning is being reached by another waits for it.
 """
 
 import threading
@@ -17,11 +17,16 @@ from velfield.sources.frames import SourceFrame
 
 FileState = tuple[Path, int, int]
 """A file, its size and time of change."""
+_LONGEST_WAIT_S, _KEPT_S = 120.0, 10.0
+"""How long a part waits for another at most, and a decoder for a part: it holds its threads and pictures."""
 
 
-def file_state(path: Path) -> FileState:
-    """State of a file that is there."""
-    found = path.stat()
+def file_state(path: Path) -> FileState | None:
+    """State of a file; None of one that is gone."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
     return path, found.st_size, found.st_mtime_ns
 
 
@@ -40,30 +45,32 @@ class Pauses:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._read: list[tuple[FileState, int]] = []
+        self._being_read: list[tuple[FileState, int]] = []
         self._paused: Pause | None = None
 
     def announce(self, file: FileState, last: int) -> None:
         """Say that a part is being read that ends with the frame ``last``, behind which its decoder will wait."""
         with self._changed:
-            self._read.append((file, last))
+            self._being_read.append((file, last))
 
     def end(self, file: FileState, last: int, pause: Pause | None) -> None:
         """Take an announcement back; ``pause``: the decoder, None where the part was not read to its end."""
-        old = None
         with self._changed:
-            self._read.remove((file, last))
-            if pause is not None:
-                old, self._paused = self._paused, pause
+            self._being_read.remove((file, last))
+            old = self._paused if pause is not None else None
+            self._paused = pause or self._paused
             self._changed.notify_all()
-        if old is not None:
-            old.frames.close()
+        _close(old)
+        if pause is not None:
+            timer = threading.Timer(_KEPT_S, self._drop, [pause])
+            timer.daemon = True
+            timer.start()
 
     def take(self, file: FileState, asked: IntArray) -> Pause | None:
         """The decoder that waits behind the first of the frames ``asked`` and goes on to the others; one that is on its
         way there is waited for."""
         with self._changed:
-            self._changed.wait_for(lambda: (file, int(asked[0])) not in self._read)
+            self._changed.wait_for(lambda: (file, int(asked[0])) not in self._being_read, _LONGEST_WAIT_S)
             found = self._paused
             if found is None or found.file != file or found.last.source_index != asked[0]:
                 return None
@@ -71,3 +78,15 @@ class Pauses:
                 return None
             self._paused = None
             return found
+
+    def _drop(self, pause: Pause) -> None:
+        """Close a decoder that nobody has taken."""
+        with self._changed:
+            old = self._paused if self._paused is pause else None
+            self._paused = None if old is not None else self._paused
+        _close(old)
+
+
+def _close(pause: Pause | None) -> None:
+    if pause is not None:
+        pause.frames.close()
