@@ -234,7 +234,7 @@ def test_a_frame_rate_that_vehicles_contradict_is_reported(
     (slow,) = [line for line in results[2.5].warnings if "--fps 2.5" in line]
     assert "about 0.5" in slow
     write_tracks(run.layout.unit_file(run.layout.tracks, 0), stopping_street(0.23, 5.0).query("track_id < 4"))
-    assert any("4 vehicles set off or stop, 10 are needed" in line for line in scale_run(plan).notes)
+    assert any("found 4 of the 10 vehicles that must set off or stop" in line for line in scale_run(plan).notes)
 
 
 def made_plan(run: Run, inputs: Inputs) -> Plan:

@@ -110,7 +110,7 @@ def _check_times(plan: Plan, record: GeoreferenceRecord) -> tuple[list[str], lis
     check = check_times(moving(from_tracklets(read_tables(paths, TRACK_COLUMNS), used.gsd_m)))
     given = f"--fps {fps:g}" if fps else "--timestamps" if plan.job.inputs.timestamps else None
     if not check.known:
-        short = f"{check.vehicles} vehicles set off or stop, {MIN_VEHICLES} are needed to check them"
+        short = f"found {check.vehicles} of the {MIN_VEHICLES} vehicles that must set off or stop to check them"
         return ([f"the times are those of {given}: {short}"] if given else []), []
     if check.plausible:
         return [], []
