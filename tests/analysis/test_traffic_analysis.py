@@ -268,6 +268,25 @@ def test_a_fast_approach_is_a_conflict_and_a_queue_and_a_double_are_none() -> No
     assert conflict.probability > 0.9
 
 
+@pytest.mark.parametrize("radius_m", [4.0, 8.0])
+def test_the_few_who_turn_off_at_a_tight_corner_have_a_lane_there(radius_m: float) -> None:
+    """They leave the lane within two metres, half of them from one node of it and half from the next."""
+    angle = np.linspace(-np.pi / 2, 0, 20)
+    arc = [150.0 - radius_m, 100.0 + radius_m] + radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    turns = [np.concatenate([[[0.27 * k, 100.0]], arc, [[150.0, 220.0]]]) for k in range(4)]
+    tracks = [drive(path, 6.0 * k + s) for path, s in ((EAST, 0.0), (SOUTH, 3.0)) for k in range(20)]
+    graph = TrafficAnalysis(
+        gather([*tracks, *(drive(path, 200.0 + 10.0 * k) for k, path in enumerate(turns))], sd_m=0.01)
+    ).lanes
+    (turn,) = (lane.number for lane in graph if lane.tracks <= 4)
+    assert len(graph) == 5
+    assert {(c.start == turn, c.end == turn) for c in graph.connections} == {
+        (True, False),
+        (False, True),
+        (False, False),
+    }
+
+
 def test_who_closes_up_beside_another_vehicle_is_no_conflict() -> None:
     free = [drive(EAST, 8.0 * k) for k in range(12)]
     leader, follower = approach(120.0, 30.0, 12.0, 6.0, 1.0)

@@ -55,7 +55,9 @@ def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:
     first, second = _moves(track, node)
     a, b, owner = node[first], node[second], track[first]
     step = nodes.xy_m[b] - nodes.xy_m[a]
-    ahead = np.cos(nodes.direction_rad[a]) * step[:, 0] + np.sin(nodes.direction_rad[a]) * step[:, 1]
+    # where a track leaves a lane, the node that it leaves may be farther along than the one that it goes to
+    ways = [of(nodes.direction_rad[a]) + of(nodes.direction_rad[b]) for of in (np.cos, np.sin)]
+    ahead = ways[0] * step[:, 0] + ways[1] * step[:, 1]
     ok = (np.hypot(step[:, 0], step[:, 1]) < _MAX_STEP_M) & (ahead > 0)
     # by hashing: there are few pairs of nodes
     number, pairs = pd.factorize(a[ok] * np.int64(len(nodes)) + b[ok], sort=True)
@@ -88,7 +90,7 @@ def make_chains(nodes: Nodes, links: Links, *, min_tracks: int) -> Chains:
     before[after[linked]] = np.flatnonzero(linked)
     for _ in range(3):
         chains = _walk(after, before)
-        drop = _stubs(chains, nodes, links, after, before, min_tracks)
+        drop = _stubs(chains, nodes, links, min_tracks)
         if not drop.any():
             break
         # what remains is linked again over the nodes left out
@@ -126,19 +128,27 @@ def _walk(after: IntArray, before: IntArray) -> list[IntArray]:
     return chains
 
 
-def _stubs(
-    chains: list[IntArray], nodes: Nodes, links: Links, after: IntArray, before: IntArray, min_tracks: int
-) -> Mask:
+def _stubs(chains: list[IntArray], nodes: Nodes, links: Links, min_tracks: int) -> Mask:
     """Nodes of short chains that lead from nowhere, or to nowhere."""
-    flow_in = np.bincount(links.end, links.tracks * (links.tracks >= min_tracks), len(nodes))
-    flow_out = np.bincount(links.start, links.tracks * (links.tracks >= min_tracks), len(nodes))
+    chain_of = np.empty(len(nodes), np.int64)
+    for c, chain in enumerate(chains):
+        chain_of[chain] = c
+    entered = _linked(links.end, chain_of[links.start], links.tracks, len(nodes), min_tracks)
+    left = _linked(links.start, chain_of[links.end], links.tracks, len(nodes), min_tracks)
     drop = np.zeros(len(nodes), bool)
     for chain in chains:
         length = np.hypot(*np.diff(nodes.xy_m[chain], axis=0).T).sum()
-        dead = flow_in[chain[0]] == 0 or flow_out[chain[-1]] == 0
-        if length < _STUB_M and dead:
+        if length < _STUB_M and not (entered[chain[0]] and left[chain[-1]]):
             drop[chain] = True
     return drop
+
+
+def _linked(node: IntArray, chain: IntArray, tracks: IntArray, n: int, min_tracks: int) -> Mask:
+    """(n,) nodes that enough tracks link with one chain: few may leave it at the same one of its nodes."""
+    pairs, number = np.unique(chain * np.int64(n) + node, return_inverse=True)
+    out = np.zeros(n, bool)
+    out[pairs[np.bincount(number, tracks) >= min_tracks] % n] = True
+    return out
 
 
 def _without(links: Links, drop: Mask) -> Links:
@@ -200,16 +210,17 @@ def _joins(
     nodes: Nodes,
     min_tracks: int,
 ) -> list[tuple[int, int, int]]:
-    """Links to the start of a chain or from its end: the strongest of each pair of chains."""
-    best: dict[tuple[int, int, bool], tuple[int, int, int]] = {}
+    """Links to the start of a chain or from its end: the strongest of each pair of chains, with the tracks of all."""
+    between: dict[tuple[int, int, bool], list[tuple[int, int, int]]] = {}
     for a, b, n in zip(links.start.tolist(), links.end.tolist(), links.tracks.tolist(), strict=True):
-        if after[a] == b or n < min_tracks or (after[a] >= 0 and before[b] >= 0):
-            continue
-        if n < _MIN_FRACTION * min(nodes.weight[a], nodes.weight[b]):
+        if after[a] == b or (after[a] >= 0 and before[b] >= 0):
             continue
         if chain_of[a] == chain_of[b] and position[b] > position[a]:
             continue  # ahead on the same lane
-        key = (int(chain_of[a]), int(chain_of[b]), after[a] < 0)
-        if key not in best or best[key][2] < n:
-            best[key] = (a, b, n)
-    return list(best.values())
+        between.setdefault((int(chain_of[a]), int(chain_of[b]), bool(after[a] < 0)), []).append((n, a, b))
+    joins = []
+    for found in between.values():
+        (_, a, b), total = max(found, key=lambda link: link[0]), sum(n for n, _, _ in found)
+        if total >= max(min_tracks, _MIN_FRACTION * min(nodes.weight[a], nodes.weight[b])):
+            joins.append((a, b, total))
+    return joins
