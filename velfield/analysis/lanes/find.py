@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray
-from velfield.analysis.lanes.graph import Chains, count_links, make_chains
+from velfield.analysis.lanes.graph import Chains, count_links, make_chains, number_chains
 from velfield.analysis.lanes.junctions import find_junctions
 from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples, Turn, WidthSource
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
@@ -76,7 +76,7 @@ def _no_samples() -> LaneSamples:
 
 def _drop_rare(chains: Chains, track: IntArray, node: IntArray, n: int, min_tracks: int) -> Chains:
     """Without the lanes of a single node or of too few tracks, which nothing connects."""
-    lane_of = _lane_of_node(chains.nodes, n)
+    lane_of = number_chains(chains.nodes, n)
     tracks = _tracks_on(track, np.where(node >= 0, lane_of[node], -1), len(chains.nodes))
     linked = {i for a, b, _ in chains.links for i in (a, b)}
     keep = [k for k, c in enumerate(chains.nodes) if tracks[k] >= min_tracks and (len(c) > 2 or k in linked)]
@@ -93,13 +93,6 @@ def _tracks_on(track: IntArray, lane: IntArray, n: int) -> IntArray:
     # a track is on a lane for many samples: first those at which it comes there, then each once
     comes = np.flatnonzero((lane >= 0) & np.r_[True, (np.diff(lane) != 0) | (np.diff(track) != 0)])
     return np.bincount(np.unique(track[comes] * np.int64(n) + lane[comes]) % n, minlength=n)
-
-
-def _lane_of_node(chains: list[IntArray], n: int) -> IntArray:
-    out = np.full(n + 1, -1, np.int64)  # the last for nodes of number -1
-    for lane, chain in enumerate(chains):
-        out[chain] = lane
-    return out
 
 
 def _centre_lines(chains: Chains, nodes: Nodes) -> list[FloatArray]:
@@ -132,7 +125,7 @@ def _smooth(xy: FloatArray) -> FloatArray:
 
 def _place(samples: PathSamples, node: IntArray, chains: Chains, n: int, lines: list[FloatArray]) -> LaneSamples:
     """Samples on their lanes, each projected onto the piece of the centre line that is nearest."""
-    lane = np.where(node >= 0, _lane_of_node(chains.nodes, n)[node], -1)
+    lane = np.where(node >= 0, number_chains(chains.nodes, n)[node], -1)
     keep = lane >= 0
     lane, xy = lane[keep], samples.xy_m[keep]
     along, offset = np.empty(len(lane)), np.empty(len(lane))

@@ -128,11 +128,17 @@ def _walk(after: IntArray, before: IntArray) -> list[IntArray]:
     return chains
 
 
+def number_chains(chains: list[IntArray], n: int) -> IntArray:
+    """(n + 1,) number of the chain of each of n nodes, -1 if none; the last is of nodes of number -1."""
+    out = np.full(n + 1, -1, np.int64)
+    for number, chain in enumerate(chains):
+        out[chain] = number
+    return out
+
+
 def _stubs(chains: list[IntArray], nodes: Nodes, links: Links, min_tracks: int) -> Mask:
     """Nodes of short chains that lead from nowhere, or to nowhere."""
-    chain_of = np.empty(len(nodes), np.int64)
-    for c, chain in enumerate(chains):
-        chain_of[chain] = c
+    chain_of = number_chains(chains, len(nodes))
     entered = _linked(links.end, chain_of[links.start], links.tracks, len(nodes), min_tracks)
     left = _linked(links.start, chain_of[links.end], links.tracks, len(nodes), min_tracks)
     drop = np.zeros(len(nodes), bool)
@@ -169,10 +175,9 @@ def _cut(
     chains: list[IntArray], nodes: Nodes, links: Links, after: IntArray, before: IntArray, min_tracks: int
 ) -> Chains:
     """Cut the chains where others begin or end at them."""
-    position = np.empty(len(nodes), np.int64)
-    chain_of = np.empty(len(nodes), np.int64)
-    for c, chain in enumerate(chains):
-        position[chain], chain_of[chain] = np.arange(len(chain)), c
+    position, chain_of = np.empty(len(nodes), np.int64), number_chains(chains, len(nodes))
+    for chain in chains:
+        position[chain] = np.arange(len(chain))
     joins = _joins(links, after, before, chain_of, position, nodes, min_tracks)
     cut_after = {a for a, _, _ in joins}
     cut_before = {b for _, b, _ in joins}

@@ -77,24 +77,26 @@ def iter_video(
 def _read_on(path: Path, info: SourceInfo, indices: IntArray, then: IntArray) -> Generator[SourceFrame, None, None]:
     """`_read_sound` by a decoder that waits at the first frame, if there is one; it waits at the last, if that pays."""
     first, last, asked = int(indices[0]), int(indices[-1]), np.concatenate([indices, then])
-    file = file_state(path) if usable_processors() <= _MOST_THREADS else None  # more decode several parts at once
-    begins, waits = _is_far(info, first, last), then.size > 0 and last > first and _is_far(info, last, 2 * last - first)
-    if file is not None and waits:
+    file = file_state(path) if usable_processors() <= _MOST_THREADS else None
+    if file is None:  # more processors decode several parts at once
+        yield from _read_sound(path, info, indices)
+        return
+    frames, pause = _read_sound(path, info, asked), None
+    waits = then.size > 0 and last > first and _is_far(info, last, 2 * last - first)
+    if waits:
         _pauses.announce(file, last)
-    pause = taken = None
-    frames: Generator[SourceFrame, None, None] | None = None
     try:
-        taken = _pauses.take(file, asked) if file is not None and begins else None
-        frames = _read_sound(path, info, asked) if taken is None else taken.frames
+        taken = _pauses.take(file, asked) if _is_far(info, first, last) else None
+        frames = frames if taken is None else taken.frames
         for frame in itertools.chain([] if taken is None else [taken.last], frames):
             yield frame
             if frame.source_index == last:
-                pause = Pause(file, frame, then, frames) if file is not None and waits else None
+                pause = Pause(file, frame, then, frames) if waits else None
                 break
     finally:
-        if file is not None and waits:
+        if waits:
             _pauses.end(file, last, pause)
-        if frames is not None and pause is None:
+        if pause is None:
             frames.close()
 
 

@@ -57,14 +57,17 @@ class Pauses:
         """Take an announcement back; ``pause``: the decoder, None where the part was not read to its end."""
         with self._changed:
             self._being_read.remove((file, last))
-            old = self._paused if pause is not None else None
-            self._paused = pause or self._paused
+            old = self._paused
+            if pause is not None:
+                self._paused = pause
             self._changed.notify_all()
-        _close(old)
-        if pause is not None:
-            timer = threading.Timer(_KEPT_S, self._drop, [pause])
-            timer.daemon = True
-            timer.start()
+        if pause is None:
+            return
+        if old is not None:
+            old.frames.close()
+        timer = threading.Timer(_KEPT_S, self._drop, [pause])
+        timer.daemon = True
+        timer.start()
 
     def take(self, file: FileState, asked: IntArray) -> Pause | None:
         """The decoder that waits behind the first of the frames ``asked`` and goes on to the others; one that is on its
@@ -82,11 +85,7 @@ class Pauses:
     def _drop(self, pause: Pause) -> None:
         """Close a decoder that nobody has taken."""
         with self._changed:
-            old = self._paused if self._paused is pause else None
-            self._paused = None if old is not None else self._paused
-        _close(old)
-
-
-def _close(pause: Pause | None) -> None:
-    if pause is not None:
+            if self._paused is not pause:
+                return
+            self._paused = None
         pause.frames.close()
