@@ -1,7 +1,6 @@
 """``velfield run``: from a video, or tracks, to the maps."""
 
 import shlex
-from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -142,8 +141,10 @@ def run(
         return _process_tracks(
             job, choose_runner(workers, scheduler, cluster), _verbosity(quiet, verbose, log_json), plan_only=plan
         )
+    from velfield.pipeline.plan import write_clips
+
     inputs = Inputs(
-        source=str(_clip_list(source, more, out) if more else source),
+        source=str(write_clips(out, (source, *more)) if more else source),
         base=_text(base),
         labels=_text(labels),
         detector=_text(detector),
@@ -253,29 +254,6 @@ def _show_plan(job: Job, runner: "RunnerConfig") -> int:
     validate_inputs(plan)
     print(describe_plan(plan, parallel_units(runner)))
     return DONE
-
-
-def _clip_list(source: Path, more: tuple[Path, ...], out: Path) -> Path:
-    """The list of several clips, written into the run folder."""
-    from velfield.run.layout import RunLayout, is_remote, to_path
-    from velfield.sources.clips import CLIPS_SUFFIX, read_clip_list, write_clip_list
-    from velfield.sources.frames import local_path
-
-    if is_remote(to_path(out)):
-        raise InputError(
-            f"{out}: several clips need a list on a local disk; write their paths, one per line, into "
-            f"clips{CLIPS_SUFFIX} "
-            "and run that file"
-        )
-    path = out / f"source{CLIPS_SUFFIX}"
-    before = set[Path]()
-    if RunLayout(out).flight.exists():
-        with suppress(InputError, FileNotFoundError):  # of one file, or of clips that are gone
-            before = set(read_clip_list(path))
-    if before and not before & {local_path(clip, "video") for clip in (source, *more)}:
-        raise InputError(f"{out} holds the run of other clips, which this would overwrite; give another --out")
-    write_clip_list(path, (source, *more))
-    return path
 
 
 def _every(text: str | None) -> int | str | None:

@@ -1,6 +1,7 @@
 """The plan of a run: its frames, its units, and the content key of every stage, known before any work is done."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,8 +16,9 @@ from velfield.field.time_intervals import TimeInterval, parse_time_intervals
 from velfield.pipeline.stage import stage_keys
 from velfield.run.commits import code_version, content_key, digest_bytes, digest_path, sealed_json, write_atomically
 from velfield.run.flight_record import check_format, read_flight_record
-from velfield.run.layout import RunLayout
-from velfield.sources.clips import clip_files
+from velfield.run.layout import RunLayout, is_remote, to_path
+from velfield.sources.clips import CLIPS_SUFFIX, clip_files, read_clip_list, write_clip_list
+from velfield.sources.frames import local_path
 from velfield.sources.source import SourceInfo, check_source, probe, select_frames
 from velfield.sources.telemetry.find import find_beside
 
@@ -250,10 +252,41 @@ def check_same_flight(plan: Plan) -> None:
     if old is None or old.given is None or old.inputs.source.digest == plan.inputs.source.digest:
         return
     if old.given.source != plan.job.inputs.source:
+        raise _other_flight(plan.layout.root, old.given.source, plan.job.inputs.source)
+
+
+def write_clips(root: Path, clips: Sequence[Path]) -> Path:
+    """Write the list of several clips of one flight, the source of its run, into the run folder; the list's path.
+
+    The list has one name in all runs, so `check_same_flight` cannot tell their flights apart: the folder holds the same
+    flight if the run before had one of the clips too.
+
+    Raises
+    ------
+    InputError
+        The folder is on S3 or holds another flight, or a clip cannot be in a list.
+    """
+    if is_remote(to_path(root)):
         raise InputError(
-            f"{plan.layout.root} holds the run of {old.given.source}, which that of {plan.job.inputs.source} would "
-            "overwrite; give another --out, or remove the folder first"
+            f"{root}: several clips need a list on a local disk; write their paths, one per line, into "
+            f"clips{CLIPS_SUFFIX} and run that file"
         )
+    path = root / f"source{CLIPS_SUFFIX}"
+    before = set[Path]()
+    if RunLayout(root).flight.exists():
+        with suppress(InputError, FileNotFoundError):  # of one file, or of clips that are gone
+            before = set(read_clip_list(path))
+    if before and before.isdisjoint(local_path(clip, "video") for clip in clips):
+        raise _other_flight(root, "other clips", " and ".join(clip.name for clip in clips))
+    write_clip_list(path, clips)
+    return path
+
+
+def _other_flight(root: Path, before: str, now: str) -> InputError:
+    return InputError(
+        f"{root} holds the run of {before}, which that of {now} would overwrite; give another --out, or remove the "
+        "folder first"
+    )
 
 
 def changed_since(plan: Plan) -> list[str]:
