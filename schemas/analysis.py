@@ -10,6 +10,11 @@ ANALYSIS_VERSION = 1
 """Version of these files."""
 
 Point = tuple[float, float]
+Turn = Literal["straight", "left", "right", "u-turn"]
+JunctionKind = Literal["intersection", "roundabout", "crossing", "merge", "diverge"]
+"""``crossing``: roads cross and no vehicle was seen to turn; from above a bridge looks so."""
+WidthSource = Literal["neighbour", "spread"]
+"""``neighbour``: distance to the lane beside it; ``spread``: of the paths across it, and a car's width."""
 
 
 class EstimateRecord(Model):
@@ -97,8 +102,7 @@ class LaneRecord(Model):
     xy_px: tuple[Point, ...]
     length_m: NonNegativeFloat
     width_m: PositiveFloat
-    width_source: Literal["neighbour", "spread"]
-    """``neighbour``: distance to the lane beside it; ``spread``: of the paths across it, and a car's width."""
+    width_source: WidthSource
     tracks: NonNegativeInt
     left: NonNegativeInt | None = None
     """Neighbouring lane of the same direction."""
@@ -117,15 +121,14 @@ class ConnectionRecord(Model):
     tracks: NonNegativeInt
     share: float = Field(ge=0, le=1)
     """Fraction of the tracks that leave the lane ``start``."""
-    turn: Literal["straight", "left", "right", "u-turn"]
+    turn: Turn
 
 
 class JunctionRecord(Model):
     """Where lanes cross, merge or diverge."""
 
     junction: NonNegativeInt
-    kind: Literal["intersection", "roundabout", "crossing", "merge", "diverge"]
-    """``crossing``: roads cross, perhaps on two levels."""
+    kind: JunctionKind
     x_px: float
     y_px: float
     hull_px: tuple[Point, ...]

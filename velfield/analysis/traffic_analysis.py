@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from schemas.analysis import JunctionKind
 from schemas.arrays import FloatArray
 from velfield.analysis.flow.conflicts import Conflict, find_conflicts
 from velfield.analysis.flow.passings import LaneTraffic
@@ -21,7 +22,7 @@ from velfield.analysis.flow.speeds import (
 from velfield.analysis.flow.volume import LaneFlow, lane_flow
 from velfield.analysis.lanes.find import find_lanes
 from velfield.analysis.lanes.junctions import inside_hull
-from velfield.analysis.lanes.model import JunctionKind, LaneGraph
+from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.car_parks import CarPark, find_car_parks
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.movements import JunctionMovements, find_movements

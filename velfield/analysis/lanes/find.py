@@ -5,10 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from scipy.spatial import cKDTree
 
+from schemas.analysis import Turn, WidthSource
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.lanes.graph import Chains, count_links, make_chains, number_chains
 from velfield.analysis.lanes.junctions import find_junctions
-from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples, Turn, WidthSource
+from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, group_rows, sample_paths
 from velfield.compiled import kernel

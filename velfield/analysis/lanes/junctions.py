@@ -8,8 +8,9 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import ConvexHull, cKDTree
 
+from schemas.analysis import JunctionKind
 from schemas.arrays import FloatArray, IntArray, Mask
-from velfield.analysis.lanes.model import Connection, Junction, JunctionKind, Lane
+from velfield.analysis.lanes.model import Connection, Junction, Lane
 
 _NEAR_M = 15.0
 """Meeting points nearer to each other are of one junction: a median is up to 14 m wide."""

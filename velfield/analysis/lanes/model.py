@@ -3,16 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
+from schemas.analysis import JunctionKind, Turn, WidthSource
 from schemas.arrays import FloatArray, IntArray
-
-Turn = Literal["straight", "left", "right", "u-turn"]
-JunctionKind = Literal["intersection", "roundabout", "crossing", "merge", "diverge"]
-"""A crossing is where lanes cross and no vehicle was seen to turn: from above a bridge looks so."""
-WidthSource = Literal["neighbour", "spread"]
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from schemas.analysis import Turn
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, estimate_share
 from velfield.analysis.lanes.junctions import inside_hull
-from velfield.analysis.lanes.model import Junction, LaneGraph, Turn
+from velfield.analysis.lanes.model import Junction, LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.gates import Gates, find_gates
 from velfield.analysis.observed import ObservedSlices
