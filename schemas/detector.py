@@ -238,8 +238,6 @@ class OnnxRecord(BaseRecord):
 
 DetectorRecord = Annotated[CnnRecord | PaperRecord | OnnxRecord, Field(discriminator="method")]
 
-RECORDS: tuple[type[BaseRecord], ...] = get_args(get_args(DetectorRecord)[0])
-
 
 class DimensionsRecord(Model):
     """The network that measures vehicles: fully connected layers with ReLU between them."""

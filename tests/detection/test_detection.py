@@ -99,8 +99,8 @@ def test_the_papers_detector_where_it_was_trained() -> None:
 @pytest.mark.parametrize("method", ["cnn", "paper"])
 def test_a_higher_threshold_detects_fewer(method: str) -> None:
     truth, normal = sample(flight(6), 1), detector(method)
-    strict = detect_frame(truth.image, None, normal, threshold=normal.threshold + 0.3)
-    assert len(strict) < len(detect_frame(truth.image, None, normal))
+    strict = normal.detect(truth.image, threshold=normal.threshold + 0.3)
+    assert len(strict) < len(normal.detect(truth.image))
     assert strict.score.min() > normal.threshold + 0.3
 
 

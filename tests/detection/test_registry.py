@@ -3,17 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import pytest
 
 from schemas.detector import (
     METHODS,
-    RECORDS,
     BaseRecord,
     CnnRecord,
     DetectorConfig,
+    DetectorRecord,
     PaperRecord,
     Rectangle,
     Round,
@@ -96,7 +96,7 @@ def test_another_detector_is_trained_and_run_by_its_name() -> None:
     found = detect_frame(sample.image, None, detector)
     assert found.xy.tolist() == sample.cars[:, :2].tolist()  # top to bottom
     assert found.patches.shape == (9, 16, 8)
-    assert len(detect_frame(sample.image, None, detector, threshold=250)) == 0
+    assert len(detector.detect(sample.image, threshold=250)) == 0
 
 
 @pytest.mark.usefixtures("toy")
@@ -120,7 +120,7 @@ def test_a_method_without_a_detector_is_an_input_error() -> None:
 def test_every_method_of_the_configuration_has_a_detector_and_a_record(model: type[DetectorConfig]) -> None:
     method = model.model_fields["method"].default
     assert detector_class(method).method == method
-    assert method in {record.model_fields["method"].default for record in RECORDS}
+    assert method in {record.model_fields["method"].default for record in get_args(get_args(DetectorRecord)[0])}
 
 
 @pytest.mark.parametrize("model", METHODS)

@@ -140,7 +140,7 @@ def link_detections(path: Path) -> int:
     """Tracklets and tracks of detections that no detector would give."""
     from schemas.flight import TrackingConfig
     from velfield.tracking.association import FrameTable
-    from velfield.tracking.joins import GapLimits, assign_tracks, reconnect_tracks
+    from velfield.tracking.joins import GapLimits, assign_tracks, close_gaps, find_ends
     from velfield.tracking.tracklets import link_windows
 
     rng = np.random.default_rng(int.from_bytes(path.read_bytes()[:8].ljust(8), "little"))
@@ -170,7 +170,9 @@ def link_detections(path: Path) -> int:
     limits = GapLimits(
         config.max_gap_s, config.max_stationary_gap_s, config.max_hidden_gap_s, config.stationary_speed_m_per_s
     )
-    return len(np.unique(reconnect_tracks(tracklets, tracks, limits, gsd_m=0.23)))
+    ids, track = np.unique(tracks, return_inverse=True)
+    starts, ends = find_ends(tracklets, track, len(ids), 0.23)
+    return len(np.unique(close_gaps(ids, ends, starts, limits).tracks))
 
 
 def _onnx_files() -> tuple[bytes, ...]:

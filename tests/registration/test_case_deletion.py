@@ -103,20 +103,6 @@ def test_the_polyprojective_holds_second_order_terms_and_the_homography_does_not
     assert first.is_homography
 
 
-def test_weights_of_zero_are_as_leaving_points_out() -> None:
-    source, target, wrong = contaminated(0.3, 7)
-    weighted = fit_polyprojective(source, target, model="homography", weights=(~wrong).astype(float))
-    without = fit_polyprojective(source[~wrong], target[~wrong], model="homography")
-    assert not isinstance(weighted, Failure)
-    assert not isinstance(without, Failure)
-    assert np.abs(weighted(source) - without(source)).max() < 0.01
-    few = np.zeros(600)
-    few[:4] = 1.0
-    failure = fit_polyprojective(source, target, model="homography", weights=few)
-    assert isinstance(failure, Failure)
-    assert failure.reason == "4 control points, a homography needs 5"
-
-
 def test_points_on_a_line_leave_the_map_harmless_or_fail() -> None:
     x = np.linspace(0, 1000, 60)
     source = np.stack([x, 0.5 * x], axis=1)

@@ -21,6 +21,7 @@ from velfield.registration.intrasensor import (
     map_keypoints,
     prepare_base,
     register_chain,
+    register_frame,
     shrink,
 )
 from velfield.registration.joint import ControlPoints, JointFit
@@ -249,8 +250,8 @@ def test_where_the_base_image_ends_the_previous_frame_carries_on() -> None:
     keypoints = seen("still", 0)[1]
     first = registered("still", [0])[0]
     previous = map_keypoints(keypoints, first.transform)
-    alone = register_chain([(1, *shown("still", 1))], half, lens, CONFIG)[0]
-    chained = register_chain([(1, *shown("still", 1))], half, lens, CONFIG, previous)[0]
+    grey, detect = shown("still", 1)
+    alone, chained = (register_frame(grey, detect(), half, lens, CONFIG, before) for before in (None, previous))
     truth = make_truth(flight)
     corner = np.array([[600.0, 240.0]])
     miss = [float(np.linalg.norm(r.transform.to_base(corner) - truth.to_base(1, corner))) for r in (alone, chained)]

@@ -22,7 +22,6 @@ from velfield.tracking.crop_alignment import (
     REWEIGHTING_ITERATIONS,
     TAPER_PX,
     TUKEY_C,
-    align_crops,
     align_prepared,
     prepare_crops,
 )
@@ -131,6 +130,10 @@ def align_plainly(before: ByteArray, after: ByteArray, axis: float) -> tuple[flo
         return np.nan, np.nan, np.nan
     noise = 2 * np.pi * BLUR_SIGMA_PX**2 * (forward + backward)
     return (fx - bx) / 2, (fy - by) / 2, np.sqrt(noise + (apart / 2) ** 2 + MIN_SD_PX**2)
+
+
+def align_crops(before, after, axis_before, axis_after, first, second):
+    return align_prepared(prepare_crops(before, axis_before), prepare_crops(after, axis_after), first, second)
 
 
 def test_the_compiled_alignment_equals_array_expressions() -> None:

@@ -14,7 +14,8 @@ from velfield.tracking.joins import (
     _assign,
     _assign_sparse,
     _assign_table,
-    reconnect_tracks,
+    close_gaps,
+    find_ends,
 )
 
 GSD_M = 0.25
@@ -35,9 +36,8 @@ def seen(start_s: float, frames: int, x_m: float, speed: float, acceleration: fl
 def reconnected(parts: Sequence[pd.DataFrame], gap_s: float = 2.0, stationary_gap_s: float = 0.0) -> list[int]:
     """The track of each part, each a track of its own before."""
     tracks = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    after = reconnect_tracks(
-        pd.concat(parts, ignore_index=True), tracks, GapLimits(gap_s, stationary_gap_s), gsd_m=GSD_M
-    )
+    starts, ends = find_ends(pd.concat(parts, ignore_index=True), tracks, len(parts), GSD_M)
+    after = close_gaps(np.arange(len(parts)), ends, starts, GapLimits(gap_s, stationary_gap_s)).tracks[tracks]
     assert all(len(set(after[tracks == k])) == 1 for k in range(len(parts)))
     return [int(after[tracks == k][0]) for k in range(len(parts))]
 
@@ -147,8 +147,9 @@ def test_an_end_is_reconnected_once() -> None:
 
 
 def test_no_tracklets() -> None:
-    empty = seen(0.0, 2, 0.0, 1.0)
-    assert reconnect_tracks(empty, np.zeros(0, np.int64), GapLimits(2.0), gsd_m=None).size == 0
+    none = np.zeros(0, np.int64)
+    starts, ends = find_ends(seen(0.0, 2, 0.0, 1.0), none, 0, None)
+    assert close_gaps(none, ends, starts, GapLimits(2.0)).tracks.size == 0
 
 
 @pytest.mark.parametrize(("tracks", "pairs"), [(3, 6), (150, 900), (500, 4000)])

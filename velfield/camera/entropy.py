@@ -6,8 +6,6 @@ is minimal for the lens that makes lines straight. The angle alone has a wide ba
 together a sharp minimum.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,8 +26,8 @@ def _entropy_nats(weights: NDArray[np.floating | np.integer]) -> float:
     return float(-np.sum(probability * np.log(probability)))
 
 
-def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: float | None = None) -> float:
-    """Entropy, in nats, of the histogram of line angle, or of angle and distance, of undistorted edge points.
+def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: float) -> float:
+    """Entropy, in nats, of the histogram of the angle and distance of lines through undistorted edge points.
 
     Parameters
     ----------
@@ -40,7 +38,7 @@ def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: f
     angle_bins
         Bins over half a turn.
     distance_bin_px
-        Bin width of the distance from the centroid of the points, undistorted px; None: angle alone.
+        Bin width of the distance from the centroid of the points, undistorted px.
 
     Returns
     -------
@@ -53,26 +51,9 @@ def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: f
     if not np.all(np.isfinite(xy)):
         return float("inf")
     angle = np.mod(np.arctan2(tangents[:, 1], tangents[:, 0]), np.pi)
-    frame = arcs.frame[arcs.arc]
     low, upper = linear_bin_weights(angle, np.pi / angle_bins)
     angle_keys = [np.mod(low, angle_bins), np.mod(low + 1, angle_bins)]
     angle_weights = [1.0 - upper, upper]
-    if distance_bin_px is None:
-        keys = np.concatenate([frame * angle_bins + key for key in angle_keys])
-        return _entropy_nats(np.bincount(keys, weights=np.concatenate(angle_weights)))
-    return _joint_entropy(arcs, xy, tangents, angle_keys, angle_weights, angle_bins, distance_bin_px)
-
-
-def _joint_entropy(
-    arcs: Arcs,
-    xy: FloatArray,
-    tangents: FloatArray,
-    angle_keys: Sequence[IntArray],
-    angle_weights: Sequence[FloatArray],
-    angle_bins: int,
-    distance_bin_px: float,
-) -> float:
-    """Entropy of (frame, angle, distance), minus the mean logarithm of the stretch."""
     unit = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
     normal *= np.where(normal[:, 1:] < 0, -1.0, 1.0)
@@ -87,11 +68,10 @@ def _joint_entropy(
             weights.append(angle_weight * distance_weight)
     _, inverse = np.unique(np.concatenate(keys), return_inverse=True)
     entropy = _entropy_nats(np.bincount(inverse, weights=np.concatenate(weights)))
-    stretch = _mean_log_stretch(arcs, xy, tangents)
-    return entropy - stretch
+    return entropy - _mean_log_stretch(arcs, xy)
 
 
-def _mean_log_stretch(arcs: Arcs, xy: FloatArray, tangents: FloatArray) -> float:
+def _mean_log_stretch(arcs: Arcs, xy: FloatArray) -> float:
     """Mean logarithm of the radial stretch at the points: distances between lines grow by about that factor."""
     radius_raw = np.linalg.norm(arcs.xy - arcs.xy.mean(axis=0), axis=1)
     radius = np.linalg.norm(xy - arcs.xy.mean(axis=0), axis=1)

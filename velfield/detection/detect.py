@@ -79,15 +79,9 @@ class FrameDetections(Detections):
         return FrameDetections(**{one.name: getattr(self, one.name)[mask] for one in fields(self)})
 
 
-def detect_frame(
-    image: GreyImage,
-    valid: Mask | None,
-    detector: Detector,
-    *,
-    threshold: float | None = None,
-) -> FrameDetections:
+def detect_frame(image: GreyImage, valid: Mask | None, detector: Detector) -> FrameDetections:
     """Detect the cars of a frame, top to bottom; the parameters are those of `Detector.detect`."""
-    cars = detector.detect(image, valid, threshold=threshold)
+    cars = detector.detect(image, valid)
     order = np.lexsort((cars.xy[:, 0], cars.xy[:, 1]))
     return attach_crops(image, cars, order)
 

@@ -93,7 +93,6 @@ def boost(
     rounds: int,
     car_fraction: float,
     rng: np.random.Generator,
-    shrinkage: float = 1.0,
 ) -> StumpSelection:
     """Train a boosted classifier (real AdaBoost: leaves are half the log odds of the weights).
 
@@ -109,8 +108,6 @@ def boost(
         Summed initial weight of the positive samples. Paper: they are 15 % of the samples.
     rng
         Draws the features of each round: the same seed gives the same detector.
-    shrinkage
-        Factor of the leaves (learning rate). Paper: 1.
     """
     weights = _initial_weights(is_car, car_fraction)
     smoothing = 0.5 / len(is_car)
@@ -125,9 +122,7 @@ def boost(
         feature, edge = _best_stump(bins, weights, active_cars, active_others, searched)
         above = bins[feature] > edge
         low_high = [
-            shrinkage
-            * 0.5
-            * np.log((weights[side & is_car].sum() + smoothing) / (weights[side & ~is_car].sum() + smoothing))
+            0.5 * np.log((weights[side & is_car].sum() + smoothing) / (weights[side & ~is_car].sum() + smoothing))
             for side in (~above, above)
         ]
         leaf = np.where(above, low_high[1], low_high[0])

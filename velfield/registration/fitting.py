@@ -78,9 +78,8 @@ def fit_polyprojective(
     target: FloatArray,
     *,
     model: Model = "polyprojective",
-    weights: FloatArray | None = None,
 ) -> PolyprojectiveTransform | Failure:
-    """Minimise the weighted squares of target - map(source): linear homography, then Levenberg-Marquardt.
+    """Minimise the squares of target - map(source): linear homography, then Levenberg-Marquardt.
 
     Parameters
     ----------
@@ -88,8 +87,6 @@ def fit_polyprojective(
         Points (n, 2), px.
     model
         ``homography`` keeps the second-order terms zero.
-    weights
-        (n,) non-negative; None: all one.
 
     Returns
     -------
@@ -97,34 +94,31 @@ def fit_polyprojective(
     """
     source, target = as_points(source), as_points(target)
     needed = N_FREE_PARAMETERS[model] // 2 + 1
-    count = len(source) if weights is None else int(np.count_nonzero(weights))
-    if count < needed:
-        return Failure(f"{count} control points, a {model} needs {needed}")
+    if len(source) < needed:
+        return Failure(f"{len(source)} control points, a {model} needs {needed}")
     source_norm, target_norm = fit_normalisation(source), fit_normalisation(target)
     m = second_order_monomials(source, source_norm)
     target_normalised = (target - target_norm[:2]) * target_norm[2]
-    root = np.ones(len(source)) if weights is None else np.sqrt(weights)
-    parameters = _fit_linear_homography(m, target_normalised, root)
-    fitted = _levenberg_marquardt(parameters, m, target_normalised, root, _free_parameters(model))
+    parameters = _fit_linear_homography(m, target_normalised)
+    fitted = _levenberg_marquardt(parameters, m, target_normalised, _free_parameters(model))
     if fitted is None:
         return Failure(f"the {model} has a pole among the control points")
     if not np.isfinite(fitted).all():
-        return Failure(f"{count} control points do not determine the {model}")
+        return Failure(f"{len(source)} control points do not determine the {model}")
     return PolyprojectiveTransform(_unpack(fitted), source_norm, target_norm)
 
 
-def _fit_linear_homography(m: FloatArray, target_normalised: FloatArray, root: FloatArray) -> FloatArray:
+def _fit_linear_homography(m: FloatArray, target_normalised: FloatArray) -> FloatArray:
     """The 17 parameters of the homography of minimum algebraic error (DLT): initial value of the refinement."""
     columns = _free_parameters("homography")
-    root2 = np.concatenate([root, root])
-    design = _design_matrix(m, target_normalised, np.ones(len(m)))[:, columns] * root2[:, None]
+    design = _design_matrix(m, target_normalised, np.ones(len(m)))[:, columns]
     parameters = np.zeros(17)
-    parameters[columns] = _solve_normal_equations(design, target_normalised.T.ravel() * root2)
+    parameters[columns] = _solve_normal_equations(design, target_normalised.T.ravel())
     return parameters
 
 
 def _levenberg_marquardt(
-    parameters: FloatArray, m: FloatArray, target_normalised: FloatArray, root: FloatArray, columns: IntArray
+    parameters: FloatArray, m: FloatArray, target_normalised: FloatArray, columns: IntArray
 ) -> FloatArray | None:
     """Levenberg-Marquardt from a homography; None if the denominator of that homography is not positive.
 
@@ -132,20 +126,19 @@ def _levenberg_marquardt(
     at a homography two directions of the parameters are undetermined. An undamped step along them, or a linear fit of
     all 17, lets noise alone drive the denominator through zero; damping keeps the parameters in place along them.
     """
-    root2 = np.concatenate([root, root])
-    state = _residuals(parameters, m, target_normalised, root2)
+    state = _residuals(parameters, m, target_normalised)
     if state is None:
         return None
     residual, mapped, denominator = state
     damping, cost = 1e-3, float(residual @ residual)
     for _ in range(_MAX_STEPS):
-        design = _design_matrix(m, mapped, denominator)[:, columns] * root2[:, None]
+        design = _design_matrix(m, mapped, denominator)[:, columns]
         normal, gradient = design.T @ design, design.T @ residual
         spread = np.trace(normal) / len(normal)
         while damping < 1e3:
             trial = parameters.copy()
             trial[columns] += np.linalg.solve(normal + damping * spread * np.eye(len(normal)), gradient)
-            state = _residuals(trial, m, target_normalised, root2)
+            state = _residuals(trial, m, target_normalised)
             if state is not None and float(state[0] @ state[0]) <= cost:
                 break
             damping *= 10.0
@@ -160,15 +153,15 @@ def _levenberg_marquardt(
 
 
 def _residuals(
-    parameters: FloatArray, m: FloatArray, target_normalised: FloatArray, root2: FloatArray
+    parameters: FloatArray, m: FloatArray, target_normalised: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Weighted residuals (2n,), mapped points (n, 2), denominators (n,); None if a denominator is not positive."""
+    """Residuals (2n,), mapped points (n, 2), denominators (n,); None if a denominator is not positive."""
     c = _unpack(parameters)
     denominator = m @ c[2]
     if not denominator.min() > 1e-6:
         return None
     mapped = (m @ c[:2].T) / denominator[:, None]
-    return (target_normalised - mapped).T.ravel() * root2, mapped, denominator
+    return (target_normalised - mapped).T.ravel(), mapped, denominator
 
 
 def _solve_normal_equations(design: FloatArray, target_normalised: FloatArray) -> FloatArray:

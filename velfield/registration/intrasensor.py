@@ -113,7 +113,6 @@ def register_chain(
     base: BaseReference,
     lens: Lens,
     config: RegistrationConfig,
-    first_previous: Keypoints | None = None,
     before: "ChainFrame | None" = None,
 ) -> list[FrameRegistration]:
     """Register a chain of frames in the order of time, or against it; results in the order of the frames.
@@ -122,8 +121,6 @@ def register_chain(
     ----------
     frames
         (index, grey (h, w) uint8, function that detects its keypoints in raw px) of each.
-    first_previous
-        Keypoints of the frame before the first, in base px (see `map_keypoints`); None: the chain begins here.
     before
         A frame of known map from which optical flow may start the first; its keypoints are not used.
     """
@@ -143,7 +140,7 @@ def register_chain(
             result = None if result is None or _is_worse(result, first) else result
             first = first or result
         if result is None:
-            previous = first_previous if latest is None else map_keypoints(latest[0](), latest[1])
+            previous = None if latest is None else map_keypoints(latest[0](), latest[1])
             result = register_frame(grey, detect(), base, lens, config, previous)
             first = result if result.ok else first
         results.append(result)

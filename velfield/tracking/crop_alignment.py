@@ -173,22 +173,20 @@ def refine_links(before: UprightCrops, after: UprightCrops, first: IntArray, sec
     )
 
 
-def align_crops(
-    before: ByteArray,
-    after: ByteArray,
-    axis_before: FloatArray,
-    axis_after: FloatArray,
-    first: IntArray,
-    second: IntArray,
-) -> FloatArray:
+def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> AlignableCrops:
+    """Prepare crops (n, side, side), uint8, of cars of axes (n,) for alignment; NaN: the weights are a disc."""
+    radius = int(np.ceil(3 * BLUR_SIGMA_PX))
+    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / BLUR_SIGMA_PX) ** 2)
+    return AlignableCrops(*_prepare(crops, axis_rad, (taps / taps.sum()).astype(np.float32)))
+
+
+def align_prepared(before: AlignableCrops, after: AlignableCrops, first: IntArray, second: IntArray) -> FloatArray:
     """Shift of the car between pairs of crops, and its standard deviation.
 
     Parameters
     ----------
     before, after
-        (n, side, side) and (m, side, side) uint8, upright crops centred on a car.
-    axis_before, axis_after
-        (n,) and (m,) axes, radians; NaN: the weights are a disc.
+        Crops of the earlier and the later frame.
     first, second
         (k,) index of each pair's crop in the earlier and the later frame.
 
@@ -198,18 +196,6 @@ def align_crops(
         Shift of the car from the earlier to the later crop in x and y, and its standard deviation along either axis,
         working px; NaN where the crops do not align.
     """
-    return align_prepared(prepare_crops(before, axis_before), prepare_crops(after, axis_after), first, second)
-
-
-def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> AlignableCrops:
-    """Prepare crops (n, side, side), uint8, of cars of axes (n,) for alignment; NaN: the weights are a disc."""
-    radius = int(np.ceil(3 * BLUR_SIGMA_PX))
-    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / BLUR_SIGMA_PX) ** 2)
-    return AlignableCrops(*_prepare(crops, axis_rad, (taps / taps.sum()).astype(np.float32)))
-
-
-def align_prepared(before: AlignableCrops, after: AlignableCrops, first: IntArray, second: IntArray) -> FloatArray:
-    """`align_crops` of prepared crops."""
     return np.asarray(_align_all(before.fields(), after.fields(), first, second, _SHIFTS), dtype=np.float64)
 
 

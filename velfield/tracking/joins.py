@@ -57,7 +57,7 @@ END_COLUMNS = [
     *("frame_0", "time_0_s", "x_0_px", "y_0_px", "vx_01_px_per_s", "vy_01_px_per_s"),
     *("frame_2", "time_2_s", "x_2_px", "y_2_px", "vx_12_px_per_s", "vy_12_px_per_s"),
 ]
-"""Columns of tracklets that `reconnect_tracks` reads."""
+"""Columns of tracklets that `find_ends` reads."""
 
 
 @dataclass(frozen=True)
@@ -98,25 +98,6 @@ class ClosedGaps:
 
     tracks: IntArray
     joins: pd.DataFrame
-
-
-def reconnect_tracks(tracklets: pd.DataFrame, tracks: IntArray, gaps: GapLimits, *, gsd_m: float | None) -> IntArray:
-    """(n,) the track of each tracklet after `close_gaps`, from motion alone.
-
-    Parameters
-    ----------
-    tracklets
-        `END_COLUMNS`.
-    tracks
-        (n,) track of each tracklet, by `velfield.tracking.tracks.assign_tracks`.
-    gaps
-        The longest gaps; 0 leaves the tracks as they are.
-    gsd_m
-        Metres a base pixel; None: the paper's.
-    """
-    ids, track = np.unique(tracks, return_inverse=True)
-    starts, ends = find_ends(tracklets, track, len(ids), gsd_m)
-    return close_gaps(ids, ends, starts, gaps).tracks[track]
 
 
 def close_gaps(

@@ -1,13 +1,11 @@
 """Data of the viewer page beside the field's own tiles: ``view/``.
 
-    run.json         sizes, units, the list of layers, which chunks are stored
-    base/            the base image as JPEG tiles
-    segments.zarr    vehicles from one frame to the next, for the line tool and the tracks under the cursor
-    replay/          positions of the vehicles, ten seconds a file, for the replay
-    flow.bin         velocities drawn from the field, for the flow animation
-    change.zarr      the change since another run, written by `velfield compare`
-
-`write_view` makes all of it from the run folder.
+run.json         sizes, units, the list of layers, which chunks are stored
+base/            the base image as JPEG tiles
+segments.zarr    vehicles from one frame to the next, for the line tool and the tracks under the cursor
+replay/          positions of the vehicles, ten seconds a file, for the replay
+flow.bin         velocities drawn from the field, for the flow animation
+change.zarr      the change since another run, written by `velfield compare`
 """
 
 import json
@@ -44,18 +42,6 @@ from velfield.viewer.replay import CHUNK_S, chunk_count, position_step, replay_c
 
 _LINE_RADIUS_PX = 1.5
 """Around a path that is one pixel wide."""
-
-
-def write_view(layout: RunLayout) -> None:
-    """Write ``view/``.
-
-    Raises
-    ------
-    InputError
-        The run has no field yet.
-    """
-    write_view_data(layout)
-    write_view_record(layout)
 
 
 def write_view_data(layout: RunLayout) -> list[Path]:

@@ -36,7 +36,6 @@ _VIEW_DEG = 0.5, 140.0
 _COMPASS_SD_DEG = 1.5
 _SATELLITES_SD_M = 2.5
 _Z90 = 1.645
-_METRES_PER_DEGREE = 111_320.0
 
 
 @dataclass(frozen=True)

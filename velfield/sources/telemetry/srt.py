@@ -52,7 +52,6 @@ _AMBIGUOUS_FROM, _TENTHS_OF_MM = 150.0, (190.0, 1000.0)
 """Whole numbers between are tenths of a millimetre, as DJI wrote them up to 2021 (240 is 24 mm). From 150 up to these,
 and above, they may be either: no drone has a lens of 16.6 mm, nor of 100 mm in that format."""
 _ZOOM_OF_ONE = 10_000
-_MAX_ZOOM = 200.0
 
 
 def parse_srt(text: str, origin: str) -> Telemetry | Failure:

@@ -103,7 +103,7 @@ def demux(container: Any, stream: Any, path: Path) -> Packets:
     return Packets(np.arange(len(rows), dtype=np.int64), key, "none", notes)
 
 
-def _stamps_ascend(path: Path, *, frames: int = 48) -> bool:
+def _stamps_ascend(path: Path) -> bool:
     """Whether frames are decoded in the order of their stamps. AVI has those of decoding; libav guesses others."""
     with capture_errors(), open_video(path) as container:
         if container.format.name != "avi":
@@ -111,7 +111,7 @@ def _stamps_ascend(path: Path, *, frames: int = 48) -> bool:
         stream = video_stream(container, path)
         stream.codec_context.thread_count = 1
         try:
-            presented = [frame.pts for frame in itertools.islice(container.decode(stream), frames)]
+            presented = [frame.pts for frame in itertools.islice(container.decode(stream), 48)]
         except av.error.FFmpegError:
             return True
     return None not in presented and all(first < second for first, second in itertools.pairwise(presented))
