@@ -48,7 +48,7 @@ def test_the_row_motion_of_the_reference_is_the_mean_of_all_frames() -> None:
         registered[frame] = (transform, ControlPoints(raw, base, np.ones(len(raw))))
     coefficients = own_base._estimate_row_motion(registered, GRID)
     rows = np.arange(5.0, HEIGHT - 5.0)
-    found = own_base._evaluate_spline(coefficients, rows, HEIGHT)
+    found = own_base._row_motion(coefficients, GRID, np.stack([rows, rows], axis=1))
     expected = wave(rows)
     off = found - expected
     assert np.sqrt((off - off.mean(axis=0)) ** 2).mean() < 0.35  # 1.2 RMS without; the frames' own waves average out
@@ -57,8 +57,7 @@ def test_the_row_motion_of_the_reference_is_the_mean_of_all_frames() -> None:
 
 def test_a_row_corrected_map_is_undone_by_its_inverse() -> None:
     rows = np.linspace(0, HEIGHT - 1, own_base._MOTION_KNOTS)
-    coefficients = np.vstack([wave(rows).T, np.zeros((1, own_base._MOTION_KNOTS))])
-    corrected = own_base._RowCorrectedMap(shift(7.0, -4.0), GRID, coefficients)
+    corrected = own_base._RowCorrectedMap(shift(7.0, -4.0), GRID, wave(rows).T)
     raw = np.random.default_rng(2).uniform([0, 0], [WIDTH - 1, HEIGHT - 1], (80, 2))
     base = corrected.to_base(raw)
     assert np.abs(base - shift(7.0, -4.0).to_base(raw)).max() > 1.0
@@ -66,7 +65,7 @@ def test_a_row_corrected_map_is_undone_by_its_inverse() -> None:
 
 
 def test_without_row_motion_the_map_is_the_frame_s_own() -> None:
-    corrected = own_base._RowCorrectedMap(shift(7.0, -4.0), GRID, np.zeros((3, 0)))
+    corrected = own_base._RowCorrectedMap(shift(7.0, -4.0), GRID, np.zeros((2, own_base._MOTION_KNOTS)))
     raw = np.array([[10.0, 20.0], [100.0, 90.0]])
     np.testing.assert_array_equal(corrected.to_base(raw), shift(7.0, -4.0).to_base(raw))
 
@@ -83,7 +82,7 @@ def mosaic() -> tuple[np.ndarray, tuple[tuple[int, int], np.ndarray, np.ndarray]
         frames[frame] = grey
         points = ControlPoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
         registered[frame] = (shift(x - 30.0, y - 40.0), points)
-    return ground, own_base._build_mosaic(frames.__getitem__, registered, GRID, np.zeros((3, 0)))
+    return ground, own_base._build_mosaic(frames.__getitem__, registered, GRID, np.zeros((2, own_base._MOTION_KNOTS)))
 
 
 def test_the_mosaic_is_the_ground_without_vehicles(

@@ -68,8 +68,6 @@ class IntersensorResult:
         (n, 2) raw px, (n, 2) base px, (n,) base px: control points and the cross-validated error of each.
     mean_error_px, cv_error_px
         Mean distance of the control points from the fit, and cross-validated, base px.
-    tried_points
-        Number of grid matches.
     scale, rotation_rad
         Base px per frame px at the frame's centre, and rotation there, from +x towards +y.
     method
@@ -88,7 +86,6 @@ class IntersensorResult:
     cv_errors_px: FloatArray
     mean_error_px: float
     cv_error_px: float
-    tried_points: int
     scale: float
     rotation_rad: float
     method: str
@@ -290,7 +287,6 @@ def _to_result(pair: ImagePair, fit: FineFit, candidate: CoarseCandidate, scores
         cv_errors_px=errors,
         mean_error_px=fit.mean_error_px,
         cv_error_px=float(errors.mean()),
-        tried_points=int(fit.inliers.size),
         scale=scale,
         rotation_rad=rotation,
         method=candidate.method,

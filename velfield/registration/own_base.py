@@ -59,14 +59,12 @@ class OwnBase:
     valid : (h, w) bool, covered by enough frames that the median is free of traffic.
     origin_xy : base pixel (0, 0) on the reference frame's undistorted grid (column, row); integers.
     frames : number of frames in the median.
-    row_motion_px : (rows, 2) row motion of the reference frame that was removed, undistorted px.
     """
 
     image: GreyImage
     valid: Mask
     origin_xy: tuple[int, int]
     frames: int
-    row_motion_px: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,9 +141,8 @@ def build_own_base(
     The base image, or a failure if fewer than three frames overlap the reference.
     """
     grey = read(reference)
-    height = grey.shape[0]
     grid, base, mask = _undistort_reference(grey, lens)
-    motion_px, count = np.zeros((height, 2)), 0
+    count = 0
     for _ in range(_MAX_ROUNDS):
         reference_image = prepare_base(base, config, mask=mask, frame_shape=grey.shape)
         known = ChainFrame.of_known_map(grey, grid.transform, reference_image)
@@ -155,13 +152,12 @@ def build_own_base(
                 f"{len(registered)} of {len(frames)} frames overlap with frame {reference}, {_MIN_FRAMES} needed"
             )
         motion = _estimate_row_motion(registered, grid)
-        motion_px += _evaluate_spline(motion, np.arange(height, dtype=np.float64), height)
         offset, base, mask = _build_mosaic(read, registered, grid, motion)
         grid = replace(grid, origin=(grid.origin[0] + offset[0], grid.origin[1] + offset[1]))
         if len(registered) in (len(frames), count):
             break
         count = len(registered)
-    return OwnBase(base, mask, grid.origin, len(registered), motion_px)
+    return OwnBase(base, mask, grid.origin, len(registered))
 
 
 def _undistort_reference(grey: GreyImage, lens: Lens) -> tuple[_Grid, GreyImage, Mask]:
@@ -205,7 +201,7 @@ def _register_chains(
 
 
 def _estimate_row_motion(registered: Mapping[int, tuple[FrameTransform, ControlPoints]], grid: _Grid) -> FloatArray:
-    """Estimate the row motion remaining in the base image: spline coefficients (3, knots).
+    """Estimate the row motion remaining in the base image: spline coefficients (2, knots).
 
     Its second-order part along the rows is not observable: each frame's polyprojective absorbs it.
     """
@@ -225,19 +221,13 @@ def _estimate_row_motion(registered: Mapping[int, tuple[FrameTransform, ControlP
         np.add.at(right, first + a, weights[:, a, None] * displacement[inside])
         for b in range(4):
             np.add.at(normal, (first + a, first + b), weights[:, a] * weights[:, b])
-    return np.vstack([np.linalg.solve(normal, right).T, np.zeros((1, _MOTION_KNOTS))])
-
-
-def _evaluate_spline(coefficients: FloatArray, rows: FloatArray, height: int) -> FloatArray:
-    """Motion (n, 2) at raw rows (n,)."""
-    if coefficients.shape[1] < 4:
-        return np.zeros((len(rows), 2))
-    first, weights = kernels.spline_basis(np.ascontiguousarray(rows), height, coefficients.shape[1])
-    return np.asarray(np.einsum("nk,cnk->nc", weights, coefficients[:2, first[:, None] + np.arange(4)]))
+    return np.ascontiguousarray(np.linalg.solve(normal, right).T)
 
 
 def _row_motion(coefficients: FloatArray, grid: _Grid, xy_base: FloatArray) -> FloatArray:
-    return _evaluate_spline(coefficients, grid.rows(xy_base), grid.height)
+    """Motion (n, 2) at base pixels (n, 2)."""
+    first, weights = kernels.spline_basis(np.ascontiguousarray(grid.rows(xy_base)), grid.height, _MOTION_KNOTS)
+    return np.asarray(np.einsum("nk,cnk->nc", weights, coefficients[:, first[:, None] + np.arange(4)]))
 
 
 def _build_mosaic(
