@@ -30,7 +30,7 @@ ExportFormat = Literal[
     "moving_features",
     "ssam",
 ]
-"""Each is a module of `velfield.exports`, of the same name; those of lanes lie in ``roads``."""
+"""Each is a module of the same name, in a package of `velfield.exports`."""
 EXPORT_FORMATS: dict[ExportFormat, str] = {
     "cog": "the field's layers as GeoTIFF",
     "geoparquet": "tracklets as lines, as Parquet",

@@ -17,14 +17,14 @@ from rasterio.warp import transform
 
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.errors import InputError
-from velfield.exports.arrows import arrows_geojson
-from velfield.exports.cog import write_cog
-from velfield.exports.geoparquet import tracklets_geoparquet
 from velfield.exports.georeference import Georeference
-from velfield.exports.geotrax import geotrax_csv, geotrax_table
-from velfield.exports.stac import stac_item
-from velfield.exports.sumo import sumo_fcd
-from velfield.exports.tracks import track_points
+from velfield.exports.gis.arrows import arrows_geojson
+from velfield.exports.gis.cog import write_cog
+from velfield.exports.gis.geoparquet import tracklets_geoparquet
+from velfield.exports.gis.stac import stac_item
+from velfield.exports.tracks.geotrax import geotrax_csv, geotrax_table
+from velfield.exports.tracks.points import track_points
+from velfield.exports.tracks.sumo import sumo_fcd
 
 GSD_M = 0.25
 UTM = CRS.from_epsg(32636)

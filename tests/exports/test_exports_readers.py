@@ -11,13 +11,13 @@ import pandas as pd
 import pytest
 
 from tests.exports.test_exports import GEOREFERENCED, GSD_M, PIXELS, UTM, tracklets_of
-from velfield.exports.cog import write_cog
-from velfield.exports.geoparquet import tracklets_geoparquet
 from velfield.exports.georeference import Georeference
-from velfield.exports.geotrax import geotrax_csv
-from velfield.exports.gpkg import LAYER, tracklets_gpkg
-from velfield.exports.stac import stac_item
-from velfield.exports.sumo import sumo_fcd
+from velfield.exports.gis.cog import write_cog
+from velfield.exports.gis.geoparquet import tracklets_geoparquet
+from velfield.exports.gis.gpkg import LAYER, tracklets_gpkg
+from velfield.exports.gis.stac import stac_item
+from velfield.exports.tracks.geotrax import geotrax_csv
+from velfield.exports.tracks.sumo import sumo_fcd
 
 PATHS = {1: (10.0, 100.0, 40.0, 0.0, 5), 2: (200.0, 150.0, 0.0, -30.0, 3)}
 LENGTHS_M = [40.0 * 0.4 * GSD_M] * 3 + [30.0 * 0.4 * GSD_M]

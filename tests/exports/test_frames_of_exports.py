@@ -16,12 +16,12 @@ from rasterio.warp import transform
 from schemas.arrays import FloatArray
 from tests.exports.test_exports import PIXELS, UTM, tracklets_of
 from tests.field_runs import field_run, tracklets_along
-from velfield.exports.arrows import arrows_geojson
 from velfield.exports.export import export_run
-from velfield.exports.geoparquet import tracklets_geoparquet
 from velfield.exports.georeference import Georeference
-from velfield.exports.geotrax import geotrax_csv
-from velfield.exports.sumo import sumo_fcd
+from velfield.exports.gis.arrows import arrows_geojson
+from velfield.exports.gis.geoparquet import tracklets_geoparquet
+from velfield.exports.tracks.geotrax import geotrax_csv
+from velfield.exports.tracks.sumo import sumo_fcd
 from velfield.run.run import Run
 from velfield.sources.tracks.read import read_tracks
 

@@ -18,10 +18,10 @@ from tests.field_runs import field_run, tracklets_along
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.exports.export import export_run
+from velfield.exports.junctions.signal_events import event_archive
+from velfield.exports.junctions.turning_counts import junction_rows, peak_hour_factor, turning_workbook
+from velfield.exports.junctions.utdf import utdf
 from velfield.exports.roads import ssam
-from velfield.exports.signal_events import event_archive
-from velfield.exports.turning_counts import junction_rows, peak_hour_factor, turning_workbook
-from velfield.exports.utdf import utdf
 
 __all__ = ["analysis"]
 

@@ -12,8 +12,8 @@ from schemas.export import ExportOptions
 from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.errors import InputError
-from velfield.exports import video
 from velfield.exports.export import export_run
+from velfield.exports.pictures import video
 
 WIDTH = 640
 

@@ -20,7 +20,7 @@ from tests.exports.test_frames_of_exports import MAPS, PATHS
 from tests.media import drifting, write_video
 from velfield.detection.onnx.detector import OnnxDetector
 from velfield.errors import Failure
-from velfield.exports.sumo import sumo_fcd
+from velfield.exports.tracks.sumo import sumo_fcd
 from velfield.pipeline.analysis.analyse import analyse_tracks
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.sources.frames import SourceInfo

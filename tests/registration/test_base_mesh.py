@@ -7,7 +7,7 @@ import pytest
 from schemas.arrays import FloatArray, GreyImage
 from schemas.flight import BaseConfig
 from tests.scenes import city, frame_grid
-from velfield.registration.base_mesh import BaseMesh, fit_base_mesh
+from velfield.registration.intersensor.base_mesh import BaseMesh, fit_base_mesh
 from velfield.registration.transforms import MeshedTransform, PolyprojectiveTransform
 
 SIDE = 700

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.scenes import by_homography, city, photograph, similarity
 from velfield.camera.lens import HarrisLens, pinhole
-from velfield.registration.coarse import (
+from velfield.registration.intersensor.coarse import (
     MIN_INLIERS,
     downscale,
     estimate_sift_homography,

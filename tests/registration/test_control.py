@@ -7,8 +7,9 @@ from schemas.flight import BaseConfig
 from tests.scenes import by_homography, city, frame_grid, photograph, similarity
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.errors import Failure
-from velfield.registration.coarse import CoarseCandidate
-from velfield.registration.control import (
+from velfield.registration.fitting import fit_polyprojective
+from velfield.registration.intersensor.coarse import CoarseCandidate
+from velfield.registration.intersensor.control import (
     FineFit,
     ImagePair,
     cv_errors,
@@ -16,9 +17,8 @@ from velfield.registration.control import (
     register_coarse_to_fine,
     warp_to_base_grid,
 )
-from velfield.registration.fitting import fit_polyprojective
-from velfield.registration.intersensor import MIN_CONSISTENT_PATCHES, VerificationPatches, verify
-from velfield.registration.modality import GRADIENT, INTENSITY
+from velfield.registration.intersensor.modality import GRADIENT, INTENSITY
+from velfield.registration.intersensor.register import MIN_CONSISTENT_PATCHES, VerificationPatches, verify
 from velfield.registration.transforms import PolyprojectiveTransform
 
 SHAPE = (300, 400)

@@ -19,7 +19,7 @@ from velfield.pipeline.stages.base_image import build_base
 from velfield.pipeline.stages.georeference import georeference_run
 from velfield.pipeline.stages.registration import register_unit
 from velfield.pipeline.units import prepare_stage
-from velfield.registration.intersensor import register_intersensor
+from velfield.registration.intersensor.register import register_intersensor
 from velfield.run.frame_transforms import read_grid, read_lens
 
 SHAPE = (360, 480)

@@ -11,8 +11,8 @@ from schemas.flight import BaseConfig
 from tests.scenes import by_homography, city, frame_grid, photograph, similarity
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.errors import Failure
-from velfield.registration.correlation import match_grid
-from velfield.registration.intersensor import IntersensorResult, register_intersensor
+from velfield.registration.intersensor.correlation import match_grid
+from velfield.registration.intersensor.register import IntersensorResult, register_intersensor
 
 SHAPE = (480, 640)
 MIDDLE = np.array([319.5, 239.5])

@@ -6,9 +6,9 @@ import pytest
 
 from tests.scenes import city
 from velfield.camera.lens import pinhole
-from velfield.registration import coarse
-from velfield.registration.correlation import match_grid, parabola_vertex
-from velfield.registration.modality import GRADIENT, INTENSITY, INVERTED, MODALITIES, Modality, invert
+from velfield.registration.intersensor import coarse
+from velfield.registration.intersensor.correlation import match_grid, parabola_vertex
+from velfield.registration.intersensor.modality import GRADIENT, INTENSITY, INVERTED, MODALITIES, Modality, invert
 
 SIDE = 300
 SHIFT = (3.25, -2.5)

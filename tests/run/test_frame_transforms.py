@@ -12,7 +12,7 @@ from schemas.flight import FlightConfig
 from schemas.records import GridRecord, RebaseRecord
 from velfield.camera.lens import HarrisLens
 from velfield.errors import InputError
-from velfield.registration.base_mesh import BaseMesh
+from velfield.registration.intersensor.base_mesh import BaseMesh
 from velfield.registration.mesh import CELLS, Support
 from velfield.registration.transforms import (
     FrameTransform,

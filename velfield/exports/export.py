@@ -1,13 +1,14 @@
 """A run in the formats of other programs: `velfield export`.
 
-A format is a module of this package, of the format's name, with what `ExportModule` lists; one whose files do not fit
-into memory has ``write(run, path, options, progress)`` in place of ``encode``. A new one is that module and its line in
-`schemas.export`.
+A format is a module of the format's name, in one of the packages here, with what `ExportModule` lists; one whose files
+do not fit into memory has ``write(run, path, options, progress)`` in place of ``encode``. A new one is that module and
+its line in `schemas.export`.
 """
 
 import tempfile
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -17,8 +18,7 @@ from velfield.run.commits import write_atomically
 from velfield.run.layout import is_remote, to_path
 from velfield.run.run import Run
 
-_OF_ROADS = ("sumo_network", "opendrive", "highd", "ssam", "trajectories")
-"""Formats whose modules lie in the package ``roads``."""
+_PACKAGES = ("gis", "junctions", "pictures", "roads", "tracks")
 
 
 class ExportModule(Protocol):
@@ -60,8 +60,8 @@ def export_module(format_name: str) -> ExportModule:
     """
     if format_name not in EXPORT_FORMATS:
         raise InputError(f"--format {format_name}: not known; expected one of {', '.join(EXPORT_FORMATS)}")
-    package = "velfield.exports.roads" if format_name in _OF_ROADS else "velfield.exports"
-    return cast(ExportModule, import_module(f"{package}.{format_name}"))
+    names = (f"velfield.exports.{package}.{format_name}" for package in _PACKAGES)
+    return cast(ExportModule, import_module(next(name for name in names if find_spec(name))))
 
 
 def export_run(

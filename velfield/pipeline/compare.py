@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from velfield.analysis.changes import find_changes
-from velfield.exports.cog import write_cog
+from velfield.exports.gis.cog import write_cog
 from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.report.change import change_figure

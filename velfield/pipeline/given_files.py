@@ -12,7 +12,7 @@ from velfield.detection.runtime import use_device
 from velfield.errors import Failure, InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.labels import rescale
-from velfield.registration.intersensor import MIRRORED, IntersensorResult, register_intersensor
+from velfield.registration.intersensor.register import MIRRORED, IntersensorResult, register_intersensor
 from velfield.sources.geo import read_base_raster
 from velfield.sources.labels.labels import read_detections, read_labels
 from velfield.sources.quality import UNUSABLE

@@ -1,7 +1,7 @@
 """Least-squares fits of homography and polyprojective, and the paper's robust estimator: case deletion.
 
 The default of a frame's registration is the joint fit (`velfield.registration.joint`). Case deletion runs there with
-``model="polyprojective"`` only, and in inter-sensor registration (`velfield.registration.control`) always.
+``model="polyprojective"`` only, and in inter-sensor registration (`velfield.registration.intersensor.control`) always.
 
 Paper: registration. Case deletion fits all remaining points, then drops the fraction ``drop_fraction`` with the largest
 errors, until the mean error is small. The paper minimises by Downhill Simplex; a linear fit refined by

@@ -27,7 +27,7 @@ from schemas.records import (
 )
 from velfield.camera.lens import Lens, lens_from_record
 from velfield.errors import InputError
-from velfield.registration.base_mesh import BaseMesh
+from velfield.registration.intersensor.base_mesh import BaseMesh
 from velfield.registration.mesh import Support, sample_cells
 from velfield.registration.transforms import (
     FrameMap,

@@ -18,8 +18,8 @@ import numpy as np
 
 from schemas.arrays import FloatArray
 from schemas.export import ExportOptions
+from velfield.exports.junctions.turning_counts import BIN_S
 from velfield.exports.roads.network import RoadNetwork, road_network
-from velfield.exports.turning_counts import BIN_S
 from velfield.run.run import Run
 
 FILE_NAME = "sumo-network.zip"

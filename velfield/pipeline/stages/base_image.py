@@ -17,7 +17,7 @@ from schemas.records import GridRecord
 from velfield.camera.lens import Lens, pinhole
 from velfield.camera.map_fit import fit_lens_to_map
 from velfield.errors import Failure, InputError
-from velfield.exports.cog import write_cog
+from velfield.exports.gis.cog import write_cog
 from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
@@ -25,8 +25,8 @@ from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_frac
 from velfield.pipeline.stages.direct import accept_lens, register_directly, trial_frames
 from velfield.pipeline.stages.lens import select_usable_frames
 from velfield.pipeline.stages.registration import detect_frame_keypoints, read_given_base, write_reference
-from velfield.registration.base_mesh import fit_base_mesh
-from velfield.registration.intersensor import IntersensorResult, register_intersensor
+from velfield.registration.intersensor.base_mesh import fit_base_mesh
+from velfield.registration.intersensor.register import IntersensorResult, register_intersensor
 from velfield.registration.intrasensor import prepare_base
 from velfield.registration.own_base import DetectKeypoints, OwnBase, build_own_base
 from velfield.report.figures import png_bytes

@@ -15,7 +15,7 @@ from schemas.georeference import ControlPointsRecord, FlightStart, GeoreferenceR
 from schemas.records import GridRecord
 from schemas.scale import ScaleEstimate
 from velfield.errors import Failure
-from velfield.exports.cog import write_cog
+from velfield.exports.gis.cog import write_cog
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.labels import base_px_per_raw_px

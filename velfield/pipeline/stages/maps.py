@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, Mask
-from velfield.exports.cog import ignore_missing_georeference, write_cog
+from velfield.exports.gis.cog import ignore_missing_georeference, write_cog
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
 from velfield.parallel import parallel_map

@@ -30,7 +30,7 @@ from velfield.pipeline.stages.georeference import (
     scale_by_grid,
     write_georeference,
 )
-from velfield.registration.intersensor import register_intersensor
+from velfield.registration.intersensor.register import register_intersensor
 from velfield.registration.transforms import PolyprojectiveTransform
 from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
 from velfield.run.frame_transforms import (

@@ -14,8 +14,8 @@ import numpy as np
 from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
+from velfield.registration.intersensor.modality import MODALITIES, Modality, Transform
 from velfield.registration.keypoints import detect_keypoints, is_plausible, match_descriptors
-from velfield.registration.modality import MODALITIES, Modality, Transform
 from velfield.registration.transforms import HomographyTransform, frame_corners
 
 MIN_INLIERS = 10

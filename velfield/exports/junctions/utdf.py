@@ -18,7 +18,7 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import HEAVY
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
-from velfield.exports.signal_events import green_duration_s
+from velfield.exports.junctions.signal_events import green_duration_s
 from velfield.run.run import Run
 
 FILE_NAME = "synchro.csv"

@@ -7,7 +7,7 @@ import pandas as pd
 
 from schemas.export import ExportOptions
 from velfield.exports.georeference import Georeference
-from velfield.exports.tracks import track_points
+from velfield.exports.tracks.points import track_points
 from velfield.run.frame_transforms import heading_deg
 from velfield.run.run import Run
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from schemas.export import ExportOptions
-from velfield.exports.figures import resized_map
+from velfield.exports.pictures.figures import resized_map
 from velfield.report.figures import png_bytes, speed_figure
 from velfield.run.run import Run
 

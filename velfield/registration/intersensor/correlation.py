@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, Mask
-from velfield.registration.modality import INTENSITY, Modality
+from velfield.registration.intersensor.modality import INTENSITY, Modality
 
 _MIN_CONTRAST = 2.0
 _MIN_COVERAGE = 0.9

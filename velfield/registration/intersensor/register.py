@@ -16,8 +16,14 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage
 from schemas.flight import BaseConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
-from velfield.registration.coarse import MIN_INLIERS, CoarseCandidate, estimate_sift_homography, search_similarity
-from velfield.registration.control import (
+from velfield.registration.fitting import Model
+from velfield.registration.intersensor.coarse import (
+    MIN_INLIERS,
+    CoarseCandidate,
+    estimate_sift_homography,
+    search_similarity,
+)
+from velfield.registration.intersensor.control import (
     FINE_RADIUS_PX,
     FineFit,
     ImagePair,
@@ -25,9 +31,8 @@ from velfield.registration.control import (
     register_coarse_to_fine,
     warp_to_base_grid,
 )
-from velfield.registration.correlation import match_grid
-from velfield.registration.fitting import Model
-from velfield.registration.modality import GRADIENT, MODALITIES, Modality
+from velfield.registration.intersensor.correlation import match_grid
+from velfield.registration.intersensor.modality import GRADIENT, MODALITIES, Modality
 from velfield.registration.transforms import FrameTransform
 
 MIRRORED = "found a mirrored image"

@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.export import ExportOptions
 from velfield.errors import InputError
-from velfield.exports.figures import resized_map
+from velfield.exports.pictures.figures import resized_map
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.report.drawing import POINTS_PER_INCH, figure_bytes, new_figure
 from velfield.report.figures import MapScale, direction_map, speed_map

@@ -15,7 +15,7 @@ import numpy as np
 from schemas.arrays import FloatArray, GreyImage, IntArray, Mask, RGBImage
 from schemas.export import ExportOptions
 from velfield.errors import InputError
-from velfield.exports.figures import resized_map
+from velfield.exports.pictures.figures import resized_map
 from velfield.field.segments import Segments, stationary_speed_px_per_s
 from velfield.report.colours import ramp_colours
 from velfield.report.figures import MapScale, colour_scale_max, round_up

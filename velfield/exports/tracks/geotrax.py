@@ -10,7 +10,7 @@ from rasterio.warp import transform
 from schemas.arrays import Points
 from schemas.export import ExportOptions
 from velfield.exports.georeference import MPS_TO_KMH, Georeference
-from velfield.exports.tracks import track_points
+from velfield.exports.tracks.points import track_points
 from velfield.run.run import Run
 from velfield.sources.geo import utm_crs
 

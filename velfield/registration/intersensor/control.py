@@ -16,10 +16,10 @@ from schemas.arrays import FloatArray, GreyImage, Mask
 from schemas.flight import BaseConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
-from velfield.registration.coarse import CoarseCandidate, downscale
-from velfield.registration.correlation import GridMatches, match_grid
 from velfield.registration.fitting import Model, fit_by_case_deletion, fit_polyprojective
-from velfield.registration.modality import GRADIENT, Modality
+from velfield.registration.intersensor.coarse import CoarseCandidate, downscale
+from velfield.registration.intersensor.correlation import GridMatches, match_grid
+from velfield.registration.intersensor.modality import GRADIENT, Modality
 from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from schemas.export import ExportOptions
-from velfield.exports.figures import resized_map
+from velfield.exports.pictures.figures import resized_map
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.report.figures import direction_figure, png_bytes
 from velfield.run.run import Run

@@ -7,8 +7,8 @@ import pandas as pd
 
 from schemas.export import ExportOptions
 from velfield.errors import InputError
-from velfield.exports.geoparquet import tracklet_lines
 from velfield.exports.georeference import Georeference
+from velfield.exports.gis.geoparquet import tracklet_lines
 from velfield.run.run import Run
 
 FILE_NAME = "tracklets.gpkg"

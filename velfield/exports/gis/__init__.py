@@ -1,0 +1,1 @@
+"""The field and the tracklets for geographic information systems."""

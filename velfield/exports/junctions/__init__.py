@@ -1,0 +1,1 @@
+"""Counts and signals of the junctions for traffic engineers' software."""

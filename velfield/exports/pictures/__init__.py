@@ -1,0 +1,1 @@
+"""Maps, report, poster and video for people."""

@@ -1,0 +1,1 @@
+"""The vehicles' tracks for other programs."""
