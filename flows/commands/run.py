@@ -137,26 +137,26 @@ def run(
             "--timestamps": timestamps, "--telemetry": telemetry, "--device": device,
         }  # fmt: skip
         inputs = _tracks_inputs(tracks, base, [name for name, value in frames_only.items() if value is not None])
-        job = Job(root=str(out), inputs=inputs, config=resolved)
-        return _process_tracks(
-            job, choose_runner(workers, scheduler, cluster), _verbosity(quiet, verbose, log_json), plan_only=plan
-        )
-    from velfield.pipeline.plan import write_clips
+    else:
+        from velfield.pipeline.plan import write_clips
 
-    inputs = Inputs(
-        source=str(write_clips(out, (source, *more)) if more else source),
-        base=_text(base),
-        labels=_text(labels),
-        detector=_text(detector),
-        detections=_text(detections),
-        timestamps=_text(timestamps),
-        telemetry=_text(telemetry),
-    )
+        inputs = Inputs(
+            source=str(write_clips(out, (source, *more)) if more else source),
+            base=_text(base),
+            labels=_text(labels),
+            detector=_text(detector),
+            detections=_text(detections),
+            timestamps=_text(timestamps),
+            telemetry=_text(telemetry),
+        )
     job = Job(root=str(out), inputs=inputs, config=resolved)
-    where = choose_runner(workers, scheduler, cluster)
+    where, verbosity = choose_runner(workers, scheduler, cluster), _verbosity(quiet, verbose, log_json)
     if plan:
-        return _show_plan(job, where)
-    status = process(job, runner=where, verbosity=_verbosity(quiet, verbose, log_json))
+        print(_describe_plan(job, where) if tracks is None else _describe_tracks(job))
+        return DONE
+    if tracks is not None:
+        return _process_tracks(job, where, verbosity)
+    status = process(job, runner=where, verbosity=verbosity)
     if status in (DONE, INCOMPLETE):
         root = shlex.quote(absolute(str(out)))
         print(f"answers {own_command()} analyse {root}   (turning counts, queues, signals, speeds)")
@@ -203,12 +203,7 @@ def _announce(job: Job, console: "Console") -> None:
     console.event("open", f"velfield {version('velfield')}: {job.inputs.source} into {job.root}")
 
 
-def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity", *, plan_only: bool) -> int:
-    if plan_only:
-        from velfield.pipeline.given_tracks.plan import describe_tracks
-
-        print(describe_tracks(job))
-        return DONE
+def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity") -> int:
     console = _prepare(verbosity)
     _announce(job, console)
     from flows.process_tracks import run_tracks
@@ -244,7 +239,7 @@ def conclude(summary: "RunSummary", console: "Console") -> int:
     return INCOMPLETE
 
 
-def _show_plan(job: Job, runner: "RunnerConfig") -> int:
+def _describe_plan(job: Job, runner: "RunnerConfig") -> str:
     from flows.runners import parallel_units
     from velfield.pipeline.check_inputs import validate_inputs
     from velfield.pipeline.estimate import describe_plan
@@ -252,8 +247,13 @@ def _show_plan(job: Job, runner: "RunnerConfig") -> int:
 
     plan = make_plan(job)
     validate_inputs(plan)
-    print(describe_plan(plan, parallel_units(runner)))
-    return DONE
+    return describe_plan(plan, parallel_units(runner))
+
+
+def _describe_tracks(job: Job) -> str:
+    from velfield.pipeline.given_tracks.plan import describe_tracks
+
+    return describe_tracks(job)
 
 
 def _every(text: str | None) -> int | str | None:
