@@ -30,7 +30,7 @@ def mark_crashed(name: str) -> int:
 
 
 def mark_abandoned() -> int:
-    """Mark what a server finds running at its start as crashed; returns how many.
+    """Mark as crashed the runs that a server lists as running when it starts; returns how many.
 
     Runs of its own deployments ended with the server before; others did where their process has ended.
     """

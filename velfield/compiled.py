@@ -19,7 +19,7 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
         find = dispatcher.get_call_template
 
         def find_without_literals(args: tuple[Any, ...], kws: dict[str, Any]) -> Any:
-            """What another kernel calls, literal types widened: else numba compiles anew for each number in a call."""
+            """What another kernel calls, literal types widened: else numba compiles again for each number in a call."""
             return find(tuple(map(types.unliteral, args)), {name: types.unliteral(kind) for name, kind in kws.items()})
 
         dispatcher.get_call_template = find_without_literals

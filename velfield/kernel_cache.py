@@ -2,7 +2,7 @@
 
 numba compares the file of a kernel alone with the one that was compiled: where ``b.outer`` calls ``a.inner`` and a.py
 changes, it would run ``outer`` with the old ``inner``. Here the code of a file lies in a folder named by a digest of
-that file and of all of ours that it imports, directly or not, so that a change of any of them compiles anew.
+that file and of all of ours that it imports, directly or not, so that a change of any of them compiles again.
 
 ``import velfield`` names `Locator` to numba, by an environment variable, so that workers and notebooks have it too.
 """

@@ -12,7 +12,7 @@ _WORD, LONG = ir.IntType(32), ir.IntType(64)
 
 
 class Place(NamedTuple):
-    """A place in an array: its address, and the type of the array's values, which a pointer need not tell."""
+    """A place in an array: its address, and the type of the array's values, which a pointer may lack."""
 
     address: Any
     element: Any

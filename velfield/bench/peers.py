@@ -28,7 +28,7 @@ _REACH_PX = 30.0
 
 
 def time_stabilo(flight: Path, config: SimulationConfig, registration_s: float) -> str:
-    """A line on registration: stabilo finds one homography a frame, on frames undistorted by the true lens.
+    """A line on registration: stabilo estimates one homography a frame, on frames undistorted by the true lens.
 
     Raises
     ------

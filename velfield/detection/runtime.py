@@ -194,8 +194,8 @@ def _session_options() -> ort.SessionOptions:
 def _providers(*, gpu: bool) -> list[Any]:
     """Execution providers that a session requests, first choice first.
 
-    With TF32's shorter mantissa scores would differ visibly. Trying all of cuDNN's ways (EXHAUSTIVE) takes five times
-    as long at each new size, and finds none that is faster.
+    With TF32's shorter mantissa scores would differ visibly. Trying all of cuDNN's algorithms (EXHAUSTIVE) takes five
+    times as long at each new size, and none of them is faster.
     """
     cuda = (_CUDA, {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"})
     return [cuda, _CPU] if gpu else [_CPU]

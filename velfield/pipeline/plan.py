@@ -258,8 +258,8 @@ def check_same_flight(plan: Plan) -> None:
 def write_clips(root: Path, clips: Sequence[Path]) -> Path:
     """Write the list of several clips of one flight, the source of its run, into the run folder; the list's path.
 
-    The list has one name in all runs, so `check_same_flight` cannot tell their flights apart: the folder holds the same
-    flight if the run before had one of the clips too.
+    The list has one name in all runs, so `check_same_flight` cannot distinguish their flights: the folder holds the
+    same flight if the run before had one of the clips too.
 
     Raises
     ------

@@ -29,7 +29,7 @@ from velfield.run.shards import block_side, decode_tile, encode_chunk, encode_ti
 _ZSTANDARD = ZstdCodec(level=1, checksum=True)
 _STATUS_BYTES = 160
 _FORMAT_KEY = "format_version"
-"""Attribute of a store that names its format; """
+"""Attribute of a store that names its format."""
 HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
@@ -50,14 +50,7 @@ def _create(
     codec: ZstdCodec | Crc32cCodec = _ZSTANDARD,
     **kw: Any,
 ) -> zarr.Array[Any]:
-    return group.create_array(
-        name,
-        shape=tuple(shape),
-        chunks=tuple(chunks),
-        dtype=dtype,
-        compressors=codec,
-        **kw,
-    )
+    return group.create_array(name, shape=tuple(shape), chunks=tuple(chunks), dtype=dtype, compressors=codec, **kw)
 
 
 def _location(path: Path) -> dict[str, Any]:
@@ -336,8 +329,7 @@ class RegistrationStore:
 
         One of ``REGISTRATION_COLUMNS``, (frames,); ``vector``, (frames, n): parameters of the transforms, NaN where a
         frame is not registered; ``error_px``, (frames, 6, 8): hold-out error by cell; ``position_sd_px``, (frames,
-        rows, columns): standard deviation of the maps by cell, NaN where there are no control points. Of a run that
-        stored none the last is the hold-out error in coarser cells, which is larger.
+        rows, columns): standard deviation of the maps by cell, NaN where there are no control points.
         """
         _check_column(self.path, name, (*REGISTRATION_COLUMNS, "vector", *_CELL_ARRAYS))
         return _read(self.path, self.group, name, slice(start, stop))

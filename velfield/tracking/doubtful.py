@@ -1,8 +1,8 @@
 """Doubtful things: tracks that never moved, far from vehicles, of which the detector is less sure than of the traffic;
 and detections that no track confirms.
 
-A detector finds roof gear, sheds and shadows as well as parked cars, and all of them stand still. What moved is a
-vehicle: its score tells how sure the detector is of vehicles in this flight. A thing that stands next to a sure vehicle
+A detector reports roof gear, sheds and shadows as well as parked cars, and all of them stand still. What moved is a
+vehicle: its score shows how sure the detector is of vehicles in this flight. A thing that stands next to a sure vehicle
 or where others drove is taken for one; the farther away it stands, the higher a score it needs, up to a limit.
 
 A vehicle is found again in the frames before and after, a leaf or a part of a shadow is not.
@@ -22,7 +22,7 @@ _ENDS = 3
 _STANDS_M = 1.0
 """A thing that may have moved farther, or faster than what is stationary, is not doubted."""
 _MIN_TRAFFIC = 10
-"""Fewer moving vehicles do not tell the usual score."""
+"""Fewer moving vehicles do not give the usual score."""
 _DRIVEN_M = 6.0
 """A thing nearer than this to a path of the traffic stands in a lane or at the kerb."""
 _LEAST, _SLOPE, _SCALE_M, _ENOUGH = -0.51, 0.64, 5.0, 0.7
@@ -86,7 +86,7 @@ def find_lone(detections: pd.DataFrame, in_tracks: pd.DataFrame, track_score: pd
         ``detection_id, frame`` of the detections of tracks, in these frames. A frame without any is not judged: nothing
         could be followed through it.
     track_score
-        Mean score of the detections of each track that is not doubtful. Fewer than `_MIN_TRAFFIC` tell no usual score.
+        Mean score of the detections of each track that is not doubtful. Fewer than `_MIN_TRAFFIC` give no usual score.
     """
     if len(track_score) < _MIN_TRAFFIC:
         return detections[:0]

@@ -69,7 +69,7 @@ def find_peaks(
     """
     smooth = cv2.GaussianBlur(probability, (0, 0), SMOOTHING_SIGMA)
     everywhere = np.empty((0, 0), np.bool_) if valid is None else valid
-    # one layout in memory, whichever part of an output it is: numba compiles anew for each
+    # one layout in memory, whichever part of an output it is: numba compiles again for each
     orientation = np.ascontiguousarray(orientation)
     return np.asarray(_peaks_kernel(smooth, orientation, everywhere, stride, np.float32(min_probability)))
 

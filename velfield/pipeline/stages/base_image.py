@@ -194,7 +194,7 @@ def _refine_by_map(
 ) -> tuple[Lens, list[str]]:
     """The lens by matches of one frame with the given image, where they decide for another; matched again through it.
 
-    A lens that is off in the corners finds no matches there: each round reaches farther out.
+    A lens that is off in the corners gives no matches there: each round reaches farther out.
     """
     best, points, last = lens, len(result.cv_errors_px), None
     for _ in range(_LENS_ROUNDS):

@@ -3,7 +3,7 @@
 One polyprojective between the two (paper: inter-sensor registration) follows neither relief of the ground, which the
 camera sees from one side and an orthophoto from above, nor what the lens model leaves. Patches are matched on the grid
 through the map found so far, the mesh is fitted to what is left, and both are repeated: a first map that is several
-pixels off in the corners finds few patches there.
+pixels off in the corners matches few patches there.
 """
 
 from dataclasses import dataclass
