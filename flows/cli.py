@@ -121,10 +121,7 @@ def main() -> None:
         chain, missing = " ".join(error.command_chain or ()), error.keyword
         name = f"value for {missing}" if missing else getattr(error.argument, "name", "")
         choices = "" if missing else _choices(error.argument)
-        print(
-            f"velfield: {chain}: {name} is missing{choices}; see `velfield {chain} --help`",
-            file=sys.stderr,
-        )
+        print(f"velfield: {chain}: {name} is missing{choices}; see `velfield {chain} --help`", file=sys.stderr)
         status = USAGE
     except CycloptsError as error:  # the library's own message is a box of several lines
         print(f"velfield: {' '.join(str(error).split())} `velfield COMMAND --help` lists all", file=sys.stderr)

@@ -93,13 +93,7 @@ class Detector(ABC):
     """Fixed cost of searching one more crop, as an area."""
 
     @abstractmethod
-    def detect(
-        self,
-        image: GreyImage,
-        valid: Mask | None = None,
-        *,
-        threshold: float | None = None,
-    ) -> Detections:
+    def detect(self, image: GreyImage, valid: Mask | None = None, *, threshold: float | None = None) -> Detections:
         """Detect cars.
 
         Parameters
@@ -112,13 +106,7 @@ class Detector(ABC):
             Score threshold in place of the detector's own.
         """
 
-    def find(
-        self,
-        image: GreyImage,
-        valid: Mask | None = None,
-        *,
-        threshold: float | None = None,
-    ) -> Detections:
+    def find(self, image: GreyImage, valid: Mask | None = None, *, threshold: float | None = None) -> Detections:
         """Candidates of a crop that has `context_px` or more on every side: what `refine` makes the detections of."""
         return self.detect(image, valid, threshold=threshold)
 

@@ -28,13 +28,7 @@ class PaperDetector(Detector):
         """Its classifier."""
         return BoostedStumps.from_rounds(self.record.rounds)
 
-    def detect(
-        self,
-        image: GreyImage,
-        valid: Mask | None = None,
-        *,
-        threshold: float | None = None,
-    ) -> Detections:
+    def detect(self, image: GreyImage, valid: Mask | None = None, *, threshold: float | None = None) -> Detections:
         """Detect cars: regions where the blurred response exceeds the threshold, their mean and covariance."""
         response = dense_response(image, self.stumps, grey_bits=self.record.grey_bits)
         if valid is not None:

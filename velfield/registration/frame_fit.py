@@ -18,16 +18,9 @@ from velfield.registration.alignment import (
 )
 from velfield.registration.fitting import fit_by_case_deletion
 from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier, rms
-from velfield.registration.keypoints import (
-    Keypoints,
-)
+from velfield.registration.keypoints import Keypoints
 from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh, measure_support
-from velfield.registration.transforms import (
-    FrameTransform,
-    PolyprojectiveTransform,
-    as_points,
-    count_row_knots,
-)
+from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, count_row_knots
 
 QUALITY_CELLS = (6, 8)
 """Rows and columns of cells over the frame, for the coverage of the control points and the map of their errors."""

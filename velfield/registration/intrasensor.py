@@ -53,12 +53,7 @@ from velfield.registration.keypoints import (
     fit_homography,
     match_guided,
 )
-from velfield.registration.transforms import (
-    FrameTransform,
-    HomographyTransform,
-    PolyprojectiveTransform,
-    as_points,
-)
+from velfield.registration.transforms import FrameTransform, HomographyTransform, PolyprojectiveTransform, as_points
 
 _BASE_SIGMA_PX = 0.5
 _PREVIOUS_SIGMA_PX = 0.7

@@ -67,23 +67,11 @@ class CnnDetector(Detector):
         """In terms of probability."""
         return _WEAK_MARGIN
 
-    def detect(
-        self,
-        image: GreyImage,
-        valid: Mask | None = None,
-        *,
-        threshold: float | None = None,
-    ) -> Detections:
+    def detect(self, image: GreyImage, valid: Mask | None = None, *, threshold: float | None = None) -> Detections:
         """Detect cars: peaks of the heatmap, non-maximum suppression."""
         return self.refine(self._find(image, valid, threshold, border_px=BORDER_PX))
 
-    def find(
-        self,
-        image: GreyImage,
-        valid: Mask | None = None,
-        *,
-        threshold: float | None = None,
-    ) -> Detections:
+    def find(self, image: GreyImage, valid: Mask | None = None, *, threshold: float | None = None) -> Detections:
         """Peaks of the heatmap above the threshold."""
         return self._find(image, valid, threshold)
 

@@ -139,11 +139,7 @@ def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> Label
     return replace(sample, valid=known if sample.valid is None else sample.valid & known)
 
 
-def evaluate_network(
-    network: Network,
-    sample: LabelledImage,
-    region: Mask | None = None,
-) -> HeldOutScores:
+def evaluate_network(network: Network, sample: LabelledImage, region: Mask | None = None) -> HeldOutScores:
     """Match a network's detections to the labels of an image, or of a region (h, w) of it."""
     detections = nms_oriented(detect_cars(Predictor(network), sample.image, sample.valid), _NMS_RADIUS_PX)
     detections = detections[detections[:, 3] > MIN_CURVE_SCORE]

@@ -149,13 +149,7 @@ class OnnxDetector(Detector):
             }
         )
 
-    def detect(
-        self,
-        image: GreyImage,
-        valid: Mask | None = None,
-        *,
-        threshold: float | None = None,
-    ) -> Detections:
+    def detect(self, image: GreyImage, valid: Mask | None = None, *, threshold: float | None = None) -> Detections:
         """Detect cars in any image; orientations that upright boxes lack are estimated."""
         table = self.detect_raw(image, threshold=threshold)
         boxes = np.column_stack([table[["x_px", "y_px", "orientation_rad"]], np.full((len(table), 2), np.nan)])

@@ -113,11 +113,7 @@ class _Scene:
         width = options.width_px or min(run.grid.width_px, _DEFAULT_WIDTH_PX)
         slow = stationary_speed_px_per_s(run.record.config.field, run.grid.gsd_m)
         speed = run.field.modal_speed_px_per_s()
-        shown = resized_map(
-            run,
-            np.where(speed >= slow, speed, np.nan),
-            options.model_copy(update={"width_px": width}),
-        )
+        shown = resized_map(run, np.where(speed >= slow, speed, np.nan), options.model_copy(update={"width_px": width}))
         if max(shown.grey.shape) > _MAX_SIDE_PX:
             raise InputError(
                 f"--width {width}: found a video of {shown.grey.shape[1]} x {shown.grey.shape[0]} px, expected at most "

@@ -10,15 +10,7 @@ from schemas.scale import ScaleEstimate
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.detection.interface import Detector
 from velfield.detection.registry import shipped_detector
-from velfield.detection.scale_search import (
-    REFINE_PX,
-    STEP,
-    View,
-    Views,
-    find_scale,
-    is_plausible_scale,
-    spread_windows,
-)
+from velfield.detection.scale_search import REFINE_PX, STEP, View, Views, find_scale, is_plausible_scale, spread_windows
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import advance
 from velfield.pipeline.stages.rectified_frames import WorkingGrid

@@ -32,11 +32,7 @@ from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_arrays, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
-from velfield.tracking.dimensions import (
-    STRIP_SHAPE,
-    looks,
-    sample_tracks,
-)
+from velfield.tracking.dimensions import STRIP_SHAPE, looks, sample_tracks
 from velfield.tracking.doubles import find_doubles, find_split_tracks
 from velfield.tracking.doubtful import find_doubtful, find_lone
 from velfield.tracking.gates import Limits, triples_pass

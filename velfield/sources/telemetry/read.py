@@ -23,10 +23,7 @@ _MAX_BYTES, _HEAD_BYTES = 256 * 2**20, 2**16
 NOT_READ = "is not read"
 """In a failure: the source holds telemetry all the same, in a format of `_NOT_READ`."""
 _KLV_NAMES = ("klv", "smpte_klv")
-_NOT_READ = {
-    "djmd": "DJI's binary telemetry (djmd)",
-    "gpmd": "GoPro's telemetry (gpmd)",
-}
+_NOT_READ = {"djmd": "DJI's binary telemetry (djmd)", "gpmd": "GoPro's telemetry (gpmd)"}
 """Streams of data that hold telemetry, which no kept and light library reads."""
 _ISO6709 = re.compile(r"([-+]\d+(?:\.\d+)?)([-+]\d+(?:\.\d+)?)([-+]\d+(?:\.\d+)?)?")
 

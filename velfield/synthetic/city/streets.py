@@ -15,16 +15,7 @@ from velfield.synthetic.city.blocks import (
     place_trees,
     rotated_box,
 )
-from velfield.synthetic.city.ground import (
-    ASPHALT,
-    GRASS,
-    KERB,
-    MARKING,
-    OLD_ASPHALT,
-    PAVEMENT,
-    Canvas,
-    lighten,
-)
+from velfield.synthetic.city.ground import ASPHALT, GRASS, KERB, MARKING, OLD_ASPHALT, PAVEMENT, Canvas, lighten
 from velfield.synthetic.city.road_network import STEP_M
 
 OVERRUN_M = 260.0
