@@ -24,7 +24,7 @@ from rich.progress import (
 from velfield.parallel import subscribe_steps
 from velfield.pipeline.result import subscribe
 
-_LINE_EVERY_S, _LOG_EVERY_S = 10.0, 30.0
+_LINE_EVERY_S = 10.0
 _TRAINS = "detector"
 """The stage that counts steps of a training."""
 Verbosity = Literal["quiet", "normal", "verbose", "json"]
@@ -76,13 +76,19 @@ class StageBars:
     stages: dict[str, StageProgress] = field(default_factory=dict)
     logged_s: float = field(default_factory=time.monotonic)
 
-    def add(self, name: str, label: str) -> StageProgress:
-        """A bar for a stage, by its name and what it is called."""
+    def add(self, name: str, label: str, steps: str = "steps") -> StageProgress:
+        """A bar for a stage, by its name, what it is called, and what its steps are."""
+        first: tuple[float, int] | None = None  # what an earlier run had done says nothing of the time left
 
         def log(done: int, total: int) -> None:
-            if self.log is not None and done < total and time.monotonic() - self.logged_s >= _LOG_EVERY_S:
-                self.logged_s = time.monotonic()
-                self.log(f"{label}: {done} of {total} steps")
+            nonlocal first
+            now_s = time.monotonic()
+            begin_s, begun = first = first or (now_s, done)
+            if self.log is not None and done < total and now_s - self.logged_s >= _LINE_EVERY_S:
+                self.logged_s = now_s
+                left_s = (now_s - begin_s) * (total - done) / (done - begun) if done > begun else None
+                left = "" if left_s is None else f", about {left_s:.0f} s left"
+                self.log(f"{label}: {done} of {total} {steps}{left}")
 
         self.stages[name] = StageProgress(self.bar, self.bar.add_task(label, total=None), log)
         return self.stages[name]

@@ -110,7 +110,9 @@ class Work:
                 for stage in stages:
                     if self._beside is None:
                         self._restart_before(stage)
-                    self._compute(self._start(stage, bars.add(stage.name, stage.label), essential), graph)
+                    steps = "frames" if stage.cut is Cut.BY_FRAMES else "parts"
+                    progress = bars.add(stage.name, stage.label, steps)
+                    self._compute(self._start(stage, progress, essential), graph)
             except BaseException:
                 self.console.print_warnings()
                 raise

@@ -1,6 +1,7 @@
 """Progress lines and warnings of a run whose output is a file, so that no bar is drawn."""
 
 import json
+import time
 
 import pytest
 
@@ -11,11 +12,19 @@ from flows.console import Console
 def test_a_log_gets_a_line_of_a_long_stage_now_and_then(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(console, "_LOG_EVERY_S", 0.0)
-    with Console().stage("detector", "detector", 3) as progress:
-        progress.at_least(2)
-        progress.at_least(3)  # its own line follows
-    assert capsys.readouterr().err.splitlines() == ["detector: 2 of 3 steps"]
+    monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
+    now_s = [time.monotonic() + 1.0]
+    monkeypatch.setattr("flows.console.time.monotonic", lambda: now_s[0])
+    with Console().stages() as bars:
+        progress = bars.add("detections", "detections", "frames")
+        progress.expect(400)
+        for done in (100, 300, 400):  # an earlier run had done 100 of them; at 400 its own line follows
+            progress.at_least(done)
+            now_s[0] += 60
+    assert capsys.readouterr().err.splitlines() == [
+        "detections: 100 of 400 frames",
+        "detections: 300 of 400 frames, about 30 s left",
+    ]
 
 
 def test_a_short_stage_leaves_no_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -27,7 +36,7 @@ def test_a_short_stage_leaves_no_line(capsys: pytest.CaptureFixture[str]) -> Non
 def test_a_program_gets_it_as_an_event_and_quiet_means_quiet(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(console, "_LOG_EVERY_S", 0.0)
+    monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
     for verbosity in ("json", "quiet"):
         with Console(verbosity).stage("frames", "frames", 9) as progress:
             progress.at_least(4)
