@@ -8,6 +8,7 @@ from tests.field_runs import tracklets_along
 from velfield.analysis.lanes.find import find_lanes, project
 from velfield.analysis.lanes.junctions import buffered_hull, inside_hull
 from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.gates import find_gates
 from velfield.analysis.trajectories import from_tracklets
 
 GSD_M = 0.25
@@ -73,10 +74,20 @@ def test_lanes_of_one_direction_are_neighbours(avenue: LaneGraph) -> None:
 
 
 def test_a_circle_is_a_roundabout() -> None:
-    ring = [np.concatenate([[[0.0, 60.0]], arc((40.0, 40.0), 13.0, 130, -70), [[80.0, 20.0]]])]
-    other = [np.concatenate([[[80.0, 16.0]], arc((40.0, 40.0), 13.0, -40, -250), [[0.0, 64.0]]])]
-    graph = graph_of([driven(path, speed_m_per_s=6.0) for path in ring * 8 + other * 8], sd_m=0.1)
-    assert "roundabout" in [junction.kind for junction in graph.junctions]
+    left, right = [[0.0, 42.0], [14.0, 42.0], [24.0, 50.0]], [[80.0, 38.0], [66.0, 38.0], [56.0, 30.0]]
+    paths = [
+        np.concatenate([entry, arc((40.0, 40.0), 16.0, begin, begin - turn), exit_])
+        for entry, begin, onwards, back in (
+            (left, 140, [[56.0, 50.0], [66.0, 42.0], [80.0, 42.0]], [[24.0, 30.0], [14.0, 38.0], [0.0, 38.0]]),
+            (right, -40, [[24.0, 30.0], [14.0, 38.0], [0.0, 38.0]], [[56.0, 50.0], [66.0, 42.0], [80.0, 42.0]]),
+        )
+        for turn, exit_ in ((100, onwards), (280, back))
+    ]
+    graph = graph_of([driven(path, speed_m_per_s=6.0) for path in paths * 6], sd_m=0.1)
+    (circle,) = (junction for junction in graph.junctions if junction.kind == "roundabout")
+    gates = find_gates(graph, circle)
+    assert len(gates.arms) == 2  # a road's entry and its exit are one arm, though they diverge at the circle
+    assert sorted((gate.arm, gate.inwards) for gate in gates.gates) == [(0, False), (0, True), (1, False), (1, True)]
 
 
 def test_two_tracks_make_no_lane() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_traffic_analysis import CYCLE_S, crossroads, gather
+from velfield.analysis.answers import find_answers
 from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.signals.queues import Stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -62,6 +63,19 @@ def test_a_long_vehicle_hides_nobody(stream: Stream) -> None:
     (lorries,) = queues(moved, time)
     assert lorries.vehicles.value == lorries.vehicles.high == 2
     assert fewer.stop_length_m == pytest.approx(VEHICLE_LENGTH_M)
+
+
+def test_a_queue_that_ends_where_the_view_begins_is_a_lower_bound(stream: Stream) -> None:
+    seen = [(t[xy[:, 1] >= 40.0], xy[xy[:, 1] >= 40.0]) for t, xy in crossroads()]
+    cut = TrafficAnalysis(gather([track for track in seen if len(track[0]) > 5]))
+    (found,) = signals_from_the_north(cut)
+    junction = found.stream.approach.junction
+    for queue, whole in zip(*(queues(s, found.green_s[1:-1]) for s in (found.stream, stream)), strict=True):
+        assert (queue.vehicles.value, queue.reaches_edge, whole.reaches_edge) == (4, True, False)
+    assert cut.delay_is_partial(junction, "N")
+    assert not cut.delay_is_partial(junction, "W")
+    (said,) = (answer.text for answer in find_answers(cut) if answer.topic == "signal")
+    assert "at least 4 vehicles" in said
 
 
 def test_where_some_are_hidden_others_may_be_behind_the_last() -> None:

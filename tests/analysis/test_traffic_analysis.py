@@ -101,6 +101,21 @@ def test_turning_counts_and_shares(analysis: TrafficAnalysis) -> None:
     assert found["N", "S"].delay_s is None
 
 
+def test_who_waits_far_before_a_junction_is_delayed_too() -> None:
+    """Every other vehicle from the west stands 100 m before the junction for 20 s; it loses 5 s to brake and start."""
+    tracks = [drive(EAST, 9.0 * k) for k in range(12)]
+    tracks += [drive(EAST, 9.0 * k + 3.0, stop_at_m=30.0, go_s=9.0 * k + 28.0) for k in range(12)]
+    tracks += [drive(RIGHT, 15.0 * k + 1.5) for k in range(5)] + [drive(SOUTH, 11.0 * k + 1.5) for k in range(10)]
+    analysis = TrafficAnalysis(gather(tracks))
+    found = {(m.arm_in, m.arm_out): m for j in analysis.movements for m in j.movements}
+    delay, travel = found["W", "E"].delay_s, found["W", "E"].travel_time_s
+    assert delay is not None
+    assert travel is not None
+    assert travel.value == pytest.approx(6.0, abs=0.7)  # over 60 m, on which nobody stands
+    lost_s = [times[-1] - times[0] - 260.0 / SPEED for times, _ in tracks[12:24]]
+    assert delay.value == pytest.approx(np.mean(lost_s) / 2, rel=0.15)
+
+
 def test_a_vehicle_that_stands_for_most_of_a_clip_does_not_outweigh_the_others() -> None:
     """Eleven vehicles of 6 s and one of 49 s in a clip of 60 s: 9.6 s in the mean, 12 s with those that were cut."""
     tracks = [drive(EAST, 3.5 * k - 3.0) for k in range(11)] + [drive(EAST, -2.0, stop_at_m=131.0, go_s=49.0)]

@@ -6,15 +6,18 @@ from typing import Literal
 
 import numpy as np
 
+from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.intervals import Estimate, estimate_event_rate
-from velfield.analysis.signals.cycles import JunctionSignal, Queue, queues
+from velfield.analysis.signals.cycles import JunctionSignal, Queue, StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS = 60.0, 30
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
+DELAY_OF_PART = " in view"
+_AT_JUNCTION_M = 30.0
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
 
@@ -57,7 +60,7 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
     """
     yield _lanes(analysis)
     if analysis.trajectories.duration_s < _SHORT_S or len(analysis.trajectories) < _FEW_TRACKS:
-        yield Answer("length", "", "too little data", too_short(analysis))
+        yield Answer("duration", "", "too little data", too_short(analysis))
     yield _classes(analysis)
     yield from _movements(analysis)
     yield from _scene(analysis)
@@ -128,7 +131,8 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
     found = [m for j in analysis.movements if kinds[j.junction.number] != "merge" for m in j.movements]
     for m in sorted(found, key=lambda m: -(m.seen + m.inferred)):
         share = f", {estimate_text(m.share, '%', 100)} of those from {m.arm_in}" if m.share else ""
-        delay = f", delay {estimate_text(m.delay_s, 's')}" if m.delay_s else ""
+        partly = DELAY_OF_PART if analysis.delay_is_partial(m.junction, m.arm_in) else ""
+        delay = f", delay {estimate_text(m.delay_s, 's')}{partly}" if m.delay_s else ""
         subject = f"{_place(analysis, m.junction)}, {m.arm_in} to {m.arm_out}"
         text = f"{count_text(round(m.seen + m.inferred), 'vehicle')}{share}{delay}"
         yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
@@ -146,9 +150,10 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
 def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
     known = [(road, road.speed_m_per_s) for road in analysis.free_flow if road.speed_m_per_s]
     for road, speed in sorted(known, key=lambda pair: -pair[1].n):
-        sign, factor = road.limit(unit), PER_M_PER_S[unit]
-        limit = f"about {sign:.0f} {unit}" if sign else "between two signs"
-        text = f"free flow {estimate_text(speed, unit, factor)}, limit {limit}"
+        factor, signs = PER_M_PER_S[unit], " or ".join(f"{sign:.0f}" for sign in road.limits(unit))
+        text = f"free flow {estimate_text(speed, unit, factor)}" + (
+            f", as under a limit of {signs} {unit}" if signs else ""
+        )
         yield Answer("speed", lanes_text(road.lanes), "found", text, speed.in_units(factor), unit)
     if not known:
         text = "too little data: no road with 8 vehicles that go freely and steadily"
@@ -168,15 +173,22 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
         longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
-        text += f"; {lanes_text(lanes)}: green at {estimate_text(streams[0].green_phase_s, 's')}"
+        text += f"; {lanes_text(lanes)}: green from {estimate_text(streams[0].green_phase_s, 's')} of it on"
+        lasts = [(s.red_phase_s.value - s.green_phase_s.value) % signal.cycle_s.value for s in streams if s.red_phase_s]
+        text += f" for {min(lasts):.0f} s" if lasts else ""
         if longest:
-            text += f", longest queue {queue_text(longest)}"
+            text += f", longest queue in view {queue_text(longest)}"
+        beyond = [s.stream.approach.lane for s in streams if ends_out_of_view(s)]
+        if beyond and longest and not longest.reaches_edge:
+            text += f" ({lanes_text(beyond)}: out of view)"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 
 def _conflicts(analysis: TrafficAnalysis) -> Answer:
     likely = [c for c in analysis.conflicts if c.likely]
-    kinds = ", ".join(f"{sum(c.kind == k for c in likely)} {k}" for k in sorted({c.kind for c in likely}))
+    where = [_near(analysis, c.xy_m) for c in likely]
+    pairs = [f"{c.kind} {at}" for c, at in zip(likely, where, strict=True)]
+    kinds = ", ".join(f"{pairs.count(pair)} {pair}" for pair in sorted(set(pairs)))
     unclear = sum(c.on_unclear_levels for c in analysis.conflicts)
     if unclear and not likely:
         text = f"{count_text(unclear, 'pair')} below 1.5 s where it is not clear that the roads are on one level"
@@ -187,6 +199,13 @@ def _conflicts(analysis: TrafficAnalysis) -> Answer:
     return _events(
         "conflicts", len(likely), analysis.trajectories.duration_s, f"{kinds}, probably less than 1.5 s apart"
     )
+
+
+def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
+    """The place of an event: the junction near it, if one is."""
+    away = [(float(np.hypot(*(junction.centre_m - xy_m))), junction.number) for junction in analysis.lanes.junctions]
+    distance_m, number = min(away, default=(np.inf, 0))
+    return f"at {_place(analysis, number)}" if distance_m < _AT_JUNCTION_M else "between junctions"
 
 
 def _unusual(analysis: TrafficAnalysis) -> Answer:
@@ -241,15 +260,24 @@ def lanes_text(lanes: Sequence[int]) -> str:
 
 
 def queue_text(queue: Queue) -> str:
-    """Vehicles of a queue, with their interval, and its length.
+    """Vehicles of a queue, with their interval, and its length; of one that goes on out of view lower bounds.
 
     Examples
     --------
     >>> queue_text(Queue(12.0, Estimate(4, 3, 6, 3), 23.4))
     '4 vehicles (3 to 6), 23 m'
+    >>> queue_text(Queue(12.0, Estimate(14, 14, 14, 14), 92.0, reaches_edge=True))
+    'at least 14 vehicles, 92 m: it ends out of view'
     """
     n = queue.vehicles
+    if queue.reaches_edge:
+        return f"at least {count_text(round(n.value), 'vehicle')}, {queue.length_m:.0f} m: it ends out of view"
     return f"{count_text(round(n.value), 'vehicle')} ({n.low:.0f} to {n.high:.0f}), {queue.length_m:.0f} m"
+
+
+def ends_out_of_view(stream: StreamSignal) -> bool:
+    """Whether a queue of a stream ends out of view at a green: how long it is is not known."""
+    return any(queue.reaches_edge for queue in queues(stream.stream, stream.green_s))
 
 
 def duration_text(seconds: float) -> str:

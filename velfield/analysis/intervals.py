@@ -15,6 +15,7 @@ from schemas.arrays import FloatArray, IntArray
 from velfield.compiled import kernel
 
 LEVEL = 0.9
+_LEAST_EXPOSURE_H = 1 / 60
 MIN_VEHICLES = 5
 """Fewer vehicles give no estimate."""
 _ALIKE_S = 5.0
@@ -229,10 +230,10 @@ def estimate_rate(counts: IntArray | FloatArray, exposure: float) -> Estimate | 
     counts
         (k,) events in k slices of equal length.
     exposure
-        Total time of all slices, h.
+        Total time of all slices, h; None is returned of less than a minute, in which a platoon may come or not.
     """
     total = float(np.sum(counts))
-    if total < MIN_VEHICLES or exposure <= 0:
+    if total < MIN_VEHICLES or exposure < _LEAST_EXPOSURE_H:
         return None
     factor = _dispersion(np.asarray(counts, np.float64))
     shape = (total + 0.5) / factor

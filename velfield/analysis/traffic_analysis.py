@@ -35,7 +35,7 @@ from velfield.analysis.movements.time_slices import (
     origins_by_slice,
     slice_edges,
 )
-from velfield.analysis.signals.cycles import JunctionSignal, find_signal
+from velfield.analysis.signals.cycles import JunctionSignal, find_signal, queues
 from velfield.analysis.signals.queues import Stops, Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
@@ -184,6 +184,22 @@ class TrafficAnalysis:
         """Whether a junction has a signal; None where that is not known."""
         signal = self.signals.get(junction)
         return signal.signalised if signal else False
+
+    @cached_property
+    def _queued_beyond(self) -> set[tuple[int, str]]:
+        """Junctions and arms whose queues end out of view at a green."""
+        out = set()
+        for found in self.movements:
+            arm = {gate.lane: found.gates.arms[gate.arm].name for gate in found.gates.gates if gate.inwards}
+            signal = self.signals.get(found.junction.number)
+            for one in signal.streams if signal else ():
+                if any(q.reaches_edge for q in queues(one.stream, one.green_s)):
+                    out.add((found.junction.number, arm.get(one.stream.approach.lane, "")))
+        return out
+
+    def delay_is_partial(self, junction: int, arm: str) -> bool:
+        """Whether the vehicles that enter a junction by an arm wait out of view too."""
+        return (junction, arm) in self._queued_beyond
 
     def junction_kind(self, junction: int) -> JunctionKind:
         """Kind of a junction: a crossing is an intersection where a signal, or how vehicles pass, shows one level."""

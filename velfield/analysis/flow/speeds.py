@@ -105,14 +105,19 @@ class FreeFlow:
     speed_m_per_s: Estimate | None
     p85_m_per_s: Estimate | None
 
-    def limit(self, unit: SpeedUnit = "km/h") -> float | None:
-        """The speed on a sign that is nearest to the free speed (`SIGNS`), in km/h or mph; None where its interval
-        holds the border of two."""
+    def limits(self, unit: SpeedUnit = "km/h") -> list[float]:
+        """Speeds on signs (`SIGNS`), in km/h or mph, of which one is nearest to the free speed."""
         if self.speed_m_per_s is None or unit not in SIGNS:
-            return None
-        ends = self.speed_m_per_s.low, self.speed_m_per_s.high
-        signs = {round(end * PER_M_PER_S[unit] / SIGNS[unit]) for end in ends}
-        return signs.pop() * SIGNS[unit] if len(signs) == 1 else None
+            return []
+        low, high = (
+            round(v * PER_M_PER_S[unit] / SIGNS[unit]) for v in (self.speed_m_per_s.low, self.speed_m_per_s.high)
+        )
+        return [sign * SIGNS[unit] for sign in range(low, high + 1)]
+
+    def limit(self, unit: SpeedUnit = "km/h") -> float | None:
+        """The one of `limits`; None where there are several."""
+        found = self.limits(unit)
+        return found[0] if len(found) == 1 else None
 
 
 def free_flow(traffic: LaneTraffic, *, position_sd_m: float = 0.0) -> list[FreeFlow]:

@@ -7,7 +7,14 @@ import numpy as np
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.flow.passings import LaneTraffic
-from velfield.analysis.intervals import MIN_VEHICLES, Estimate, estimate_mean, estimate_median, estimate_rate
+from velfield.analysis.intervals import (
+    MIN_VEHICLES,
+    Estimate,
+    estimate_mean,
+    estimate_median,
+    estimate_rate,
+    independent_vehicles,
+)
 from velfield.analysis.lanes.model import LaneSamples
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
@@ -101,7 +108,7 @@ def lane_flow(
     return LaneFlow(
         lane,
         estimate_rate(by_slice.slices.sums(passing.time_s), by_slice.slices.hours),
-        estimate_mean(by_slice.density_veh_per_km) if enough else None,
+        _density(by_slice) if enough else None,
         _space_mean_speed(traffic.samples(lane)),
         estimate_mean(headway),
         estimate_median(gap[gap > 0], passing.time_s[follows][gap > 0]),
@@ -122,6 +129,21 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
     area = length * np.maximum(slices.end_s - slices.begin_s, 1e-9)
     speed = np.divide(driven, spent, out=np.full(len(slices), np.nan), where=spent > 0)
     return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed, samples)
+
+
+def _density(by_slice: FlowSlices) -> Estimate | None:
+    """Mean density. A few slices may be alike by chance: how much vehicles that come by chance, each for its own time,
+    would make them differ counts for one more."""
+    density = by_slice.density_veh_per_km
+    rows, _, wait = _steps(by_slice.samples)
+    _, of = np.unique(by_slice.samples.track[rows], return_inverse=True)
+    spent = np.bincount(of, wait).astype(np.float64)
+    at = np.bincount(of, wait * by_slice.samples.time_s[rows]) / np.maximum(spent, 1e-9)
+    if len(spent) < 2:
+        return None
+    clusters = len(spent) / max(independent_vehicles(spent, at), 2.0)
+    share = np.sqrt((spent**2).sum() / spent.sum() ** 2 * clusters)
+    return estimate_mean(density, spread=(float(density.mean() * share * np.sqrt(len(density))), 1))
 
 
 def _steps(samples: LaneSamples) -> tuple[IntArray, FloatArray, FloatArray]:

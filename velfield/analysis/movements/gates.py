@@ -11,6 +11,8 @@ from velfield.analysis.lanes.model import Junction, LaneGraph
 
 _ARM_M = 17.0
 """Gates of one arm are nearer to each other: a median may lie between them."""
+_ROAD_M = 20.0
+"""Arms are told apart so far outside the junction: at a roundabout the entry and the exit of a road diverge."""
 _REACH_M, _ASIDE_M = 6.0, 2.5
 """A vehicle crosses the border at a gate that is no farther from it, and hardly more than half a lane to the side."""
 _ARM_RAD = np.radians(35)
@@ -68,23 +70,33 @@ class Gates:
 def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
     """Gates and arms of a junction."""
     found: list[tuple[int, bool, FloatArray, float]] = []
+    roads: list[tuple[int, bool, FloatArray, float]] = []
     for lane in graph:
         inside = inside_hull(lane.xy_m, junction.hull_m)
         for k in np.flatnonzero(inside[:-1] != inside[1:]):
-            middle = (lane.xy_m[k] + lane.xy_m[k + 1]) / 2
-            step = lane.xy_m[k + 1] - lane.xy_m[k]
-            found.append((lane.number, bool(inside[k + 1]), middle, float(np.arctan2(step[1], step[0]))))
-    arms = group_gates(found)
+            inwards = bool(inside[k + 1])
+            found.append((lane.number, inwards, *_middle(lane.xy_m, int(k))))
+            outside = np.flatnonzero(~inside[: k + 1] if inwards else ~inside[k + 1 :]) + (0 if inwards else k + 1)
+            way = outside[np.abs(lane.along_m[outside] - lane.along_m[k]) < _ROAD_M]
+            far = min(int(way[0] if inwards else way[-1]), len(lane.xy_m) - 2)
+            roads.append((lane.number, inwards, *_middle(lane.xy_m, far)))
+    arms = group_gates(roads)
     numbers = sorted(set(arms.tolist()))
     middles = [
         np.mean([f[2] for f, arm in zip(found, arms, strict=True) if arm == number], axis=0) for number in numbers
     ]
-    outward = [_outward([f for f, arm in zip(found, arms, strict=True) if arm == number]) for number in numbers]
+    outward = [_outward([f for f, arm in zip(roads, arms, strict=True) if arm == number]) for number in numbers]
     order = sorted(range(len(numbers)), key=lambda k: float((outward[k] + np.pi / 2) % (2 * np.pi)))
     rank = {numbers[k]: i for i, k in enumerate(order)}
     gates = tuple(Gate(*f, arm=rank[int(arm)]) for f, arm in zip(found, arms, strict=True))
     names = name_arms({i: outward[k] for i, k in enumerate(order)}, {i: middles[k] for i, k in enumerate(order)})
     return Gates(gates, tuple(Arm(i, names[i], middles[k]) for i, k in enumerate(order)))
+
+
+def _middle(xy_m: FloatArray, k: int) -> tuple[FloatArray, float]:
+    """Middle and direction of the ``k``-th step of a line."""
+    step = xy_m[k + 1] - xy_m[k]
+    return (xy_m[k] + xy_m[k + 1]) / 2, float(np.arctan2(step[1], step[0]))
 
 
 def _outward(gates: list[tuple[int, bool, FloatArray, float]]) -> float:

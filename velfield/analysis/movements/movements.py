@@ -22,12 +22,14 @@ from velfield.analysis.movements.gates import Gates, find_gates
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
-_UPSTREAM_M = 60
-"""A travel time begins so far before the junction where the track does."""
+_UPSTREAM_M, _FARTHER_M = 60, 90
+"""A travel time begins so far before the junction where the track does; a delay so much farther where it is seen."""
+_PACED_M = 20.0
+"""How fast vehicles come freely is measured over so many of these metres at least."""
 _FURNESS_STEPS = 60
 _SLICE_S = 120.0
 """Counts of slices so long show how much the flow varies."""
-_MIN_PASSES, _MIN_DELAYED, _MIN_FREE = 3, 10, 3
+MIN_PASSES, _MIN_DELAYED, _MIN_FREE = 3, 10, 3
 """Fewest vehicles of a movement; of which the delay is known; and of these that do not stop."""
 _WAITS_S = 1.5
 """A vehicle that needs longer for a metre has stopped."""
@@ -44,6 +46,7 @@ class Passes:
     """Tracks in a junction, one row a pass: gates by number, -1 where the track was not seen to enter (or leave).
 
     ``entry_s``, ``exit_s`` and ``upstream_s`` (``_UPSTREAM_M`` before the entry) are times, NaN where unknown;
+    ``farther_m`` and ``farther_s``: how far before that the track is seen, up to ``_FARTHER_M``, and for how long;
     ``joined``: of two tracks or more of one vehicle, of which ``track`` is the one that enters (or leaves);
     ``stood``: at some time between upstream and exit.
     """
@@ -56,6 +59,17 @@ class Passes:
     upstream_s: FloatArray
     joined: Mask
     stood: Mask
+    farther_m: FloatArray
+    farther_s: FloatArray
+
+    @property
+    def travel_s(self) -> FloatArray:
+        """(n,) times from upstream of the junction to its exit, NaN where unknown."""
+        return self.exit_s - self.upstream_s
+
+    def select(self, rows: Mask) -> "Passes":
+        """Some of the passes (n,)."""
+        return Passes(*(getattr(self, name)[rows] for name in Passes.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
@@ -70,8 +84,11 @@ class Movement:
         Fraction of the vehicles that enter by the arm.
     flow_veh_per_h
         Vehicles an hour.
-    travel_time_s, delay_s
-        From 60 m before the junction to its exit, and what that is longer than for vehicles that pass freely.
+    travel_time_s
+        From 60 m before the junction to its exit.
+    delay_s
+        What that is longer than for vehicles that pass freely, and what they need longer for up to 90 m before, as far
+        as they are seen.
     """
 
     junction: int
@@ -139,7 +156,7 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
     if not len(inside):
         none, number = np.empty(0), np.empty(0, np.int64)
         no = np.empty(0, bool)
-        return Passes(number, number, number, none, none, none, no, no)
+        return Passes(number, number, number, none, none, none, no, no, none, none)
     breaks = np.flatnonzero((np.diff(inside) > 1) | (np.diff(samples.track[inside]) != 0)) + 1
     first, last = inside[np.r_[0, breaks]], inside[np.r_[breaks - 1, len(inside) - 1]]
     enters = (first > 0) & (samples.track[np.maximum(first - 1, 0)] == samples.track[first])
@@ -149,6 +166,8 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
     gate_out = np.where(leaves, gates.nearest(samples.xy_m[last], samples.direction_rad[last], inwards=False), -1)
     up = np.maximum(first - _UPSTREAM_M, 0)
     reaches = enters & (samples.track[up] == samples.track[first])
+    far = np.maximum(up - _FARTHER_M, np.searchsorted(samples.track, samples.track[first]))
+    far = np.where(reaches, far, up)
     waits = np.r_[0, np.cumsum(np.diff(samples.time_s) > _WAITS_S)]
     return Passes(
         samples.track[first],
@@ -159,6 +178,8 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
         np.where(reaches, samples.time_s[up], np.nan),
         np.zeros(len(first), bool),
         reaches & (waits[last] > waits[up]),
+        np.where(reaches, up - far, 0.0),
+        np.where(reaches, samples.time_s[up] - samples.time_s[far], 0.0),
     )
 
 
@@ -174,13 +195,13 @@ def _by_track(passes: Passes, cut: CutTracks) -> Passes:
     track[used] = cut.track_at(passes.track[used], known[used])
     joined[used] = cut.has_gap(passes.track[used], entry[used], leave[used])
     made = replace(passes, track=track, joined=joined)
-    return Passes(*(getattr(made, name)[used] for name in Passes.__dataclass_fields__))
+    return made.select(used)
 
 
 def _within(passes: Passes, begin_s: float, end_s: float) -> Passes:
     time = np.where(np.isfinite(passes.entry_s), passes.entry_s, passes.exit_s)
     keep = (time >= begin_s) & (time <= end_s)
-    return Passes(*(getattr(passes, name)[keep] for name in Passes.__dataclass_fields__))
+    return passes.select(keep)
 
 
 def _count(
@@ -197,14 +218,14 @@ def _count(
     found = np.bincount(arm_out[(arm_out >= 0) & (arm_in < 0)], minlength=n).astype(np.float64)
     known = seen + joined
     inferred = joined + furness(known, lost, found)
-    pairs = [(int(i), int(j)) for i, j in zip(*np.nonzero(known >= _MIN_PASSES), strict=True)]
-    spread = _spread([_travel_times(passes, both & (arm_in == i) & (arm_out == j))[0] for i, j in pairs])
+    pairs = [(int(i), int(j)) for i, j in zip(*np.nonzero(known >= MIN_PASSES), strict=True)]
+    spread = _spread([passes.travel_s[both & (arm_in == i) & (arm_out == j)] for i, j in pairs])
     for i, j in pairs:
         rows = both & (arm_in == i) & (arm_out == j)
         total = seen[i, j] + inferred[i, j]
         entering = seen[i].sum() + inferred[i].sum()
         counts = slices.sums(passes.entry_s[rows]) * total / max(known[i, j], 1)
-        travel, delay = _delay(*_travel_times(passes, rows), observed_s, spread)
+        travel, delay = _travel_and_delay(passes.select(rows), observed_s, spread)
         effective = round(float(known[i].sum()))
         share = estimate_share(total / entering * effective, effective)
         yield Movement(
@@ -243,37 +264,44 @@ def furness(seen: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
     return np.asarray(out)
 
 
-def _travel_times(passes: Passes, rows: Mask) -> tuple[FloatArray, FloatArray, Mask]:
-    """Travel times from upstream of the junction to its exit, where they are known, when they begin, and whether the
-    vehicle stood on the way."""
-    time = (passes.exit_s - passes.upstream_s)[rows]
-    known = np.isfinite(time)
-    return time[known], passes.upstream_s[rows][known], passes.stood[rows][known]
-
-
 def _spread(times_s: Sequence[FloatArray]) -> tuple[float, int]:
     """Standard deviation of travel times about their movement's mean, and the number of vehicles that it counts for."""
-    used = [times for times in times_s if len(times) > 1]
+    known = [times[np.isfinite(times)] for times in times_s]
+    used = [times for times in known if len(times) > 1]
     degrees = sum(len(times) - 1 for times in used)
     squares = sum(float(((times - times.mean()) ** 2).sum()) for times in used)
     return (float(np.sqrt(squares / degrees)), _SPREAD_N) if degrees else (0.0, 0)
 
 
-def _delay(
-    time_s: FloatArray, begin_s: FloatArray, stood: Mask, observed_s: FloatArray, spread: tuple[float, int]
+def _travel_and_delay(
+    passes: Passes, observed_s: FloatArray, spread: tuple[float, int]
 ) -> tuple[Estimate | None, Estimate | None]:
     """Travel time of a movement, and its delay against the fastest tenth of its vehicles that do not stop; no delay
     where hardly any passes without a stop."""
-    # Those that take long are more often cut by the begin and the end of the time that is seen.
+    known = passes.select(np.isfinite(passes.travel_s))
+    travel = _mean_time(known.travel_s, known, observed_s, spread)
+    free = known.select(~known.stood)
+    if travel is None or travel.n < _MIN_DELAYED or len(free.track) < _MIN_FREE:
+        return travel, None
+    paced = free.farther_m >= _PACED_M
+    pace = float(np.quantile(free.farther_s[paced] / free.farther_m[paced], 0.1)) if paced.any() else np.inf
+    longer = np.maximum(known.farther_s - pace * known.farther_m, 0.0) if paced.any() else np.zeros(len(known.track))
+    whole = _mean_time(known.travel_s + longer, known, observed_s, spread)
+    least = float(np.quantile(free.travel_s, 0.1))
+    assert whole is not None
+    return travel, Estimate(whole.value - least, max(whole.low - least, 0.0), whole.high - least, whole.n)
+
+
+def _mean_time(
+    time_s: FloatArray, passes: Passes, observed_s: FloatArray, spread: tuple[float, int]
+) -> Estimate | None:
+    """Mean time of passes: those that take long are more often cut by the begin and the end of what is seen, and weigh
+    more."""
     clip_s = np.diff(observed_s, axis=1)
     weight = 1 / np.maximum(np.maximum(clip_s - time_s, 0.0).sum(axis=0) / clip_s.sum(), _LEAST_SEEN)
     weight = weight / weight.mean() if len(weight) else weight
     mean = float((weight * time_s).mean()) if len(time_s) else 0.0
-    travel = estimate_mean(mean + weight * (time_s - mean), begin_s, spread=spread)
-    if travel is None or travel.n < _MIN_DELAYED or np.sum(~stood) < _MIN_FREE:
-        return travel, None
-    free = float(np.quantile(time_s[~stood], 0.1))
-    return travel, Estimate(travel.value - free, max(travel.low - free, 0.0), travel.high - free, travel.n)
+    return estimate_mean(mean + weight * (time_s - mean), passes.upstream_s, spread=spread)
 
 
 def _turn(gates: Gates, passes: Passes, rows: FloatArray) -> Turn:

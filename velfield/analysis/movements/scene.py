@@ -38,6 +38,7 @@ _CUT_BY_TIME_S = 1.0
 _MIN_WHOLE = 3
 """Fewer vehicles of known destination do not show where those that are cut went."""
 _DISPERSION_SLICE_S = 120.0
+_YARD_M_PER_S = 6.0
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ def find_scene_gates(
         found.append((lane, inwards, line.xy_m[k], float(line.direction_rad[k])))
     facing = {k for i, a in enumerate(found) for j, b in enumerate(found) if _faces(a, b) for k in (i, j)}
     found = [end for k, end in enumerate(found) if k not in facing]
-    used = [end for end in found if _mostly_ends(end, trajectories, samples)]
+    used = [end for end in found if _mostly_ends(end, trajectories, samples, graph)]
     if not used:
         return (), ()
     label = group_gates(used)
@@ -218,8 +219,9 @@ def _faces(a: End, b: End) -> bool:
     return bool(-3.0 < ahead < _HIDDEN_M and aside < 2.0 + 0.2 * max(ahead, 0.0) and turn < _TURN_RAD)
 
 
-def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples) -> bool:
-    """Whether most tracks at a lane's start begin there (at its end: end there), but those that time cuts."""
+def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, graph: LaneGraph) -> bool:
+    """Whether most tracks at a lane's start begin there (at its end: end there), but those that time cuts; within the
+    picture slowly, as at a yard: where vehicles come up at speed they were not seen before."""
     _, inwards, xy, direction = end
     near = within(samples.xy_m, xy - _REACH_M, xy + _REACH_M)
     here = _at_gate(samples.xy_m[near], samples.direction_rad[near], xy, direction, inwards=inwards)
@@ -229,7 +231,10 @@ def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples) -> 
     by_time = trajectories.is_cut_by_time(time, _CUT_BY_TIME_S, begins=inwards)
     ends = _at_gate(samples.xy_m[rows], samples.direction_rad[rows], xy, direction, inwards=inwards)
     known = ends | ~by_time
-    return bool(ends.sum() >= _MIN_WHOLE and ends.sum() >= _MIN_FRACTION * known.sum())
+    if ends.sum() < _MIN_WHOLE or ends.sum() < _MIN_FRACTION * known.sum():
+        return False
+    slow = float(np.median(samples.speed_m_per_s[rows[ends]])) < _YARD_M_PER_S
+    return slow or _from_border_m(xy, graph) <= _INSIDE_M
 
 
 def _terminal(samples: PathSamples, n: int, *, first: bool) -> IntArray:

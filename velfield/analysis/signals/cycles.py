@@ -33,6 +33,9 @@ _SPACING_M = 6.4
 """From front to front in a queue."""
 _MAX_HIDDEN = 2.4
 """Room for more vehicles than this ends a queue."""
+_EDGE_M = 25.0
+"""The last of a queue stands so near to where its approach comes into view: who stops in its first 15 m or so is hardly
+tracked, and others may stand out of view."""
 _BEYOND_M, _SAME_M = 3.2, 2.0
 """The first of a queue stands so far beyond its stop line at most; fronts that lie nearer to each other are one's."""
 _START_UP_VEHICLES = 4
@@ -44,7 +47,7 @@ _RATE_S, _MIN_RATE_CROSSINGS = 8.0, 3
 and taken for theirs."""
 _THINNING_S = 1.2
 """Crossings thin out over the last so long: drivers' speeds differ, and so does how late they can still not stop."""
-_RED_SD_S = 0.2
+_RED_SD_S = 0.45
 """By which the end of crossings differs from the onset of red from junction to junction: standard deviation."""
 
 
@@ -345,11 +348,14 @@ class Queue:
         are hidden behind the last one: vehicles are as often as between others.
     length_m
         From the stop line to the last one's rear.
+    reaches_edge
+        It ends where the approach comes into view, or `REACH_M` before the line: number and length are lower bounds.
     """
 
     time_s: float
     vehicles: Estimate
     length_m: float
+    reaches_edge: bool = False
 
 
 def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
@@ -365,7 +371,8 @@ def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
         most = _stand_at(stream, float(time), late, through_gaps=True)
         value = found.seen + found.hidden
         vehicles = Estimate(value, min(least.seen, value), max(most.seen + most.room, value) + behind, found.seen)
-        out.append(Queue(float(time), vehicles, found.length_m))
+        reaches_edge = found.seen > 0 and stream.stop_line_m - found.length_m < _EDGE_M
+        out.append(Queue(float(time), vehicles, found.length_m, reaches_edge))
     return out
 
 

@@ -102,7 +102,11 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     def service(found: JunctionMovements, m: Movement) -> str | None:
         if m.delay_s is None:
             return None
-        return level_of_service(m.delay_s.value, signalised=analysis.is_signalised(found.junction.number)) or None
+        level = level_of_service(m.delay_s.value, signalised=analysis.is_signalised(found.junction.number))
+        return f"{level} or worse" if level and analysis.delay_is_partial(m.junction, m.arm_in) else level or None
+
+    def partly(m: Movement) -> str:
+        return "yes" if m.delay_s and analysis.delay_is_partial(m.junction, m.arm_in) else ""
 
     columns: list[Column[tuple[JunctionMovements, Movement]]] = [
         Column("junction", "Junction", "", lambda row: row[1].junction),
@@ -117,12 +121,14 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("heavy", "Lorries and buses", "%", lambda row: heavy_share(analysis, row[0].tracks(row[1])), 100.0),
         estimates("travel_time", "Travel time", "s", lambda row: row[1].travel_time_s),
         estimates("delay", "Delay", "s", lambda row: row[1].delay_s),
+        Column("delay_of_part", "Queues end out of view", "", lambda row: partly(row[1])),
         Column("los", "Level of service", "", lambda row: service(*row)),
     ]
     rows = ((found, m) for found in analysis.movements for m in found.movements)
     note = (
         "Arms are named by the side of the image. Inferred: a track is cut, and its other end follows from what enters "
-        "and leaves (Furness). Delay is against the fastest tenth of those that do not stop. Levels of service: "
+        "and leaves (Furness). Delay is against the fastest tenth of those that do not stop, over the "
+        "junction and up to 150 m before it; it is longer where queues end out of view. Level of service: "
         "Highway Capacity Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere; none where it is not "
         "known which."
     )
@@ -228,6 +234,7 @@ def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("queue", "Queue at green", "veh", lambda row: _mean([q.vehicles.value for q in row[2]]), 1),
         estimates("queue_max", "Longest queue", "veh", lambda row: _longest(row[2]).vehicles if row[2] else None),
         Column("queue_max_m", "Longest queue", "m", lambda row: _longest(row[2]).length_m if row[2] else None, 1),
+        Column("queue_open", "Queues that end out of view", "", lambda row: sum(q.reaches_edge for q in row[2])),
         estimates("stops", "Vehicles that stop", "%", lambda row: stopping_share(row[1].stream), 100.0),
     ]
     note = (

@@ -12,7 +12,7 @@ from schemas.arrays import FloatArray, GreyImage
 from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.flow.conflicts import LIKELY
 from velfield.analysis.flow.volume import flow_slices
-from velfield.analysis.movements.movements import JunctionMovements
+from velfield.analysis.movements.movements import MIN_PASSES, JunctionMovements
 from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, lane_names
@@ -27,18 +27,23 @@ _RED = "#c62828"
 _PALE_BOX = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
 _MAX_JUNCTIONS = 4
 _SHOWN_S, _SLICE_S = 300.0, 60.0
+_ASIDE_M = 12.0
+_LABEL_AT = (0.33, 0.5, 0.67, 0.2, 0.8, 0.1, 0.9)
+"""Shares of a lane's length at which its number may stand: the first that has room."""
 _BESIDE_M, _AHEAD_RAD = 2.5, np.radians(45)
 
 
 @dataclass(frozen=True)
 class Diagram:
-    """A picture of the report: ``draw`` fills axes that are ``height_in`` high on a page 7 inches wide."""
+    """A picture of the report: ``draw`` fills axes that are ``height_in`` high on a page 7 inches wide; ``bare``: it
+    has no labels outside them."""
 
     name: str
     title: str
     caption: str
     draw: Callable[["Axes"], None]
     height_in: float = 3.2
+    bare: bool = False
 
 
 def traffic_diagrams(
@@ -49,10 +54,12 @@ def traffic_diagrams(
         "place",
         "The place",
         "Lanes with their direction of travel and their numbers; J: junctions, small where lanes only merge or part; "
-        "in red, the roads by which vehicles enter and leave. Text and tables use these names. "
+        "in red, the roads by which vehicles enter and leave, N at the top of the image. J3 is junction 3 in the text; "
+        "a junction's own arms are named likewise by the side that they lead to. "
         "Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn.",
         partial(draw_place, analysis=analysis, picture=picture),
-        4.6,
+        4.3,
+        bare=True,
     )
     junctions = sorted(
         (m for m in analysis.movements if _is_junction(analysis, m.junction.number) and m.movements),
@@ -62,18 +69,22 @@ def traffic_diagrams(
         yield Diagram(
             f"turning-{found.junction.number}",
             f"Junction {found.junction.number}: where vehicles go",
-            "Arrows are as wide as the flow. Vehicles counted, and their share of those that enter by the same arm. "
+            "Arrows are as wide as the flow. Vehicles counted, and their share of those that enter by the arm; rare "
+            f"ways: fewer than {MIN_PASSES} went. "
             "Arms are named by the side of the image that they lead to (N: its top).",
             partial(draw_turning, found=found),
             4.6,
+            bare=True,
         )
         delays = approach_delays(analysis, found)
         if delays:
             yield Diagram(
                 f"delay-{found.junction.number}",
                 f"Junction {found.junction.number}: delay and level of service by approach",
-                "Mean delay against vehicles that pass freely. Letters: level of service by the Highway Capacity "
-                "Manual, 7th edition (A: best, F: worst); dashed: where the next level begins.",
+                "Mean delay against vehicles that pass freely, in view, up to 150 m before the junction, of those that "
+                "were seen for 60 m; black lines: its 90 % interval. Or worse: queues end out of view. "
+                "Level of service by the Highway Capacity Manual, 7th edition (A: best, F: "
+                "worst); dashed: where the next level begins.",
                 partial(draw_delays, delays=delays),
                 1.4 + 0.4 * len(delays),
             )
@@ -88,6 +99,7 @@ def traffic_diagrams(
             f"{LIKELY} or more.",
             partial(draw_conflicts, analysis=analysis, picture=picture),
             4.6,
+            bare=True,
         )
 
 
@@ -113,7 +125,7 @@ def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Ite
     yield Diagram(
         f"queue-{number}",
         f"Junction {number}: queues against time",
-        "Vehicles that stand before the stop line of each approach.",
+        "Vehicles that stand from the stop line on, to the first gap: none from green on, when those at the line go.",
         partial(draw_queues, analysis=analysis, streams=streams, names=names),
     )
 
@@ -133,8 +145,8 @@ def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements]
         yield Diagram(
             "fundamental",
             "Flow against density",
-            f"A point is a lane in {_SLICE_S:.0f} s. Free traffic rises with the density; where points fall off to "
-            "the right, it is congested. Dashed: the speed that 85 % do not exceed.",
+            f"A point is a lane in {_SLICE_S:.0f} s; the slope of the line from the origin to it is its speed, stops "
+            "included. Dashed: the speed that 85 % of the points do not exceed.",
             partial(draw_fundamental, points=points, per_m_per_s=PER_M_PER_S[unit], unit=unit),
         )
     for found in junctions[:1]:
@@ -142,7 +154,7 @@ def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements]
             yield Diagram(
                 "flow",
                 f"Junction {found.junction.number}: vehicles that enter, by minute",
-                "By the arm that they enter from.",
+                "By the arm that they enter from, in whole minutes.",
                 partial(draw_flow, analysis=analysis, found=found),
             )
 
@@ -166,24 +178,36 @@ def _draw_map(axes: "Axes", analysis: TrafficAnalysis, picture: GreyImage | None
 def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
     """Lanes with arrows and numbers, and the junctions' numbers, over the base image."""
     _draw_map(axes, analysis, picture)
-    for lane in analysis.lanes:
+    arms = analysis.scene.arms if analysis.scene else ()
+    taken = [junction.centre_m for junction in analysis.lanes.junctions] + [arm.xy_m for arm in arms]
+    apart_m = float(np.abs(np.diff(axes.get_xlim()))[0]) / 28
+    for lane in sorted(analysis.lanes, key=lambda lane: lane.length_m):
         if lane.length_m >= 12:
             at = lane.at(lane.length_m / 2), lane.at(lane.length_m / 2 + 3)
             style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 11}
             axes.annotate("", xy=(at[1][0], at[1][1]), xytext=(at[0][0], at[0][1]), arrowprops=style)
-            x, y = lane.at(lane.length_m / 3)
+            places = [lane.at(share * lane.length_m) for share in _LABEL_AT]
+            free = [min((float(np.hypot(*(place - one))) for one in taken), default=np.inf) for place in places]
+            best = int(np.argmax(np.minimum(free, apart_m)))
+            taken.append(places[best])
+            x, y = places[best]
             axes.text(x, y, str(lane.number), ha="center", va="center", fontsize=6.5, color="#0b4f8a", bbox=_PALE_BOX)
+    _draw_junctions(axes, analysis)
+    for arm in arms:
+        x, y = arm.xy_m
+        axes.text(x, y, arm.name, ha="center", va="center", fontsize=8, color="#7a1f1f", fontweight="bold")
+    _draw_scale(axes)
+
+
+def _draw_junctions(axes: "Axes", analysis: TrafficAnalysis, *, aside_m: float = 0.0) -> None:
+    """Numbers of the junctions, small where lanes only merge or part, beside what is drawn there."""
     for junction in analysis.lanes.junctions:
         kind = analysis.junction_kind(junction.number)
         box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
         box["linestyle"] = "--" if kind == "crossing" else "-"
         size = 6.5 if kind in ("merge", "diverge") else 11
-        x, y = junction.centre_m
+        x, y = junction.centre_m + aside_m
         axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=size, fontweight="bold", bbox=box)
-    for arm in analysis.scene.arms if analysis.scene else ():
-        x, y = arm.xy_m
-        axes.text(x, y, arm.name, ha="center", va="center", fontsize=8, color="#7a1f1f", fontweight="bold")
-    _draw_scale(axes)
 
 
 def _draw_scale(axes: "Axes") -> None:
@@ -220,12 +244,14 @@ def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
             axes.plot(*line[:-4].T, color=tone, linewidth=width, alpha=0.8, solid_capstyle="butt")
             style = {"arrowstyle": "-|>", "color": tone, "mutation_scale": 9 + 1.4 * width, "linewidth": 0}
             axes.annotate("", xy=(line[-1, 0], line[-1, 1]), xytext=(line[-8, 0], line[-8, 1]), arrowprops=style)
-        total = sum(m.seen + m.inferred for m in mine)
-        lines = [f"from {name}: {total:.0f}" if mine else f"{name}: exit only"]
-        lines += [
+        lines = [
             f"to {m.arm_out}: {m.seen + m.inferred:.0f}" + (f" ({100 * m.share.value:.0f} %)" if m.share else "")
             for m in mine
         ]
+        counted = sum(m.seen + m.inferred for m in mine)
+        total = max([counted, *((m.seen + m.inferred) / m.share.value for m in mine if m.share)])
+        lines += [f"by rare ways: {total - counted:.0f}"] if total - counted >= 0.5 else []
+        lines = [f"from {name}: {total:.0f}", *lines] if mine else [f"{name}: hardly any from there"]
         side = "left" if outward[0] > 0.3 else "right" if outward[0] < -0.3 else "center"
         up = "top" if outward[1] > 0.7 else "bottom" if outward[1] < -0.7 else "center"
         axes.text(
@@ -249,14 +275,15 @@ def _bezier(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Float
 def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
     """Delay by approach with levels of service."""
     limits = delays[0].limits_s
-    top = max(max(d.delay_s for d in delays) * 1.35, *limits[1:2])
+    top = max(max(d.high_s for d in delays) * 1.8, *limits[1:2])
     for limit in limits:
         if limit < top:
             axes.axvline(limit, color="#8a929b", linestyle="--", linewidth=0.8, zorder=0)
     for k, delay in enumerate(delays):
         axes.barh(k, delay.delay_s, color="#5b6770", height=0.6)
-        label = f" {delay.level}   {delay.delay_s:.0f} s, {delay.vehicles:.0f} vehicles"
-        axes.text(delay.delay_s, k, label, va="center", fontsize=9, fontweight="bold",
+        axes.plot([delay.low_s, delay.high_s], [k, k], color="#1b1f24", linewidth=1.5)
+        label = f"{delay.level_text}   {delay.delay_s:.0f} s, of {delay.n} vehicles"
+        axes.text(delay.high_s + 0.01 * top, k, label, va="center", fontsize=9, fontweight="bold",
                   bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
     axes.set(yticks=range(len(delays)), yticklabels=[f"from {d.arm}" for d in delays], xlabel="delay, s", xlim=(0, top))
     axes.invert_yaxis()
@@ -303,7 +330,7 @@ def draw_time_space(axes: "Axes", *, analysis: TrafficAnalysis, stream: StreamSi
     for red in red_times(stream, _cycle_s(analysis, stream)):
         axes.plot(red, [0, 0], color=_RED, linewidth=5, solid_capstyle="butt")
     low = float(points[:, 1].min(initial=-20.0))
-    axes.set(xlim=(begin, end), ylim=(max(low, -120), 40), xlabel="time, s", ylabel="beyond the stop line, m")
+    axes.set(xlim=(begin, end), ylim=(max(low, -120), 40), xlabel="time, s", ylabel="distance past the stop line, m")
 
 
 def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[StreamSignal], names: dict[int, str]) -> None:
@@ -315,8 +342,8 @@ def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[Stream
         counts = [q.vehicles.value for q in queues(stream.stream, times)]
         axes.step(times, counts, where="post", color=_TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
                   label=names.get(lane, f"lane {lane}"))  # fmt: skip
-    axes.set(xlabel="time, s", ylabel="vehicles that stand", ylim=(0, None), xlim=(begin, end))
-    axes.legend(loc="upper left", bbox_to_anchor=(0, 1.14), ncols=4, frameon=False, fontsize=9)
+    axes.set(xlabel="time, s", ylabel="standing vehicles", ylim=(0, None), xlim=(begin, end))
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=4, frameon=False, fontsize=9)
 
 
 def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, unit: SpeedUnit) -> None:
@@ -324,13 +351,13 @@ def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, un
     factor, stations = PER_M_PER_S[unit], [s for s in analysis.profile(lane) if s.p50]
     at = [s.along_m for s in stations]
     low, high = ([getattr(s.p50, end) * factor for s in stations] for end in ("low", "high"))
-    axes.fill_between(at, low, high, color="#d5d9de", label="90 % of the median")
+    axes.fill_between(at, low, high, color="#d5d9de", label="90 % interval of the median")
     for name, label, stroke in (("p85", "85 %", "--"), ("p50", "median", "-"), ("p15", "15 %", ":")):
         known = [(s.along_m, getattr(s, name).value * factor) for s in stations if getattr(s, name)]
         if known:
             axes.plot(*np.array(known).T, color="#1b1f24", linestyle=stroke, label=label)
     axes.set(xlabel="along the lane, m", ylabel=f"speed, {unit}", ylim=(0, None))
-    axes.legend(ncols=4, frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0, 1.14))
+    axes.legend(ncols=4, frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0, 1.0))
 
 
 def fundamental_points(analysis: TrafficAnalysis) -> FloatArray:
@@ -358,7 +385,7 @@ def draw_fundamental(axes: "Axes", *, points: FloatArray, per_m_per_s: float, un
     middle = (0.55 * edge, 0.55 * edge * speed * 3.6)
     axes.annotate(f"{speed * per_m_per_s:.0f} {unit} ", middle, fontsize=9, ha="right", va="bottom")
     axes.set(xlabel="density, vehicles a km", ylabel="flow, vehicles an hour", xlim=(0, right * 1.05), ylim=(0, top))
-    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.14), columnspacing=1)
+    axes.legend(frameon=False, fontsize=9, ncols=6, loc="lower left", bbox_to_anchor=(0, 1.0), columnspacing=1)
 
 
 def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovements) -> None:
@@ -376,7 +403,7 @@ def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovemen
             axes.step(edges / 60, minutes, where="post", color=_TONES[k % 6], linestyle=_STROKES[k % 4],
                       linewidth=1.6, label=f"from {one.name}")  # fmt: skip
     axes.set(xlabel="time, min", ylabel="vehicles a minute", ylim=(0, None))
-    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.14))
+    axes.legend(frameon=False, fontsize=9, ncols=6, loc="lower left", bbox_to_anchor=(0, 1.0))
 
 
 def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
@@ -386,4 +413,5 @@ def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImag
     for k, kind in enumerate(sorted({c.kind for c in likely})):
         at = np.array([c.xy_m for c in likely if c.kind == kind])
         axes.plot(*at.T, _MARKS[k], color=_RED, markeredgecolor="white", markersize=8, label=f"{kind}: {len(at)}")
+    _draw_junctions(axes, analysis, aside_m=_ASIDE_M)
     axes.legend(frameon=True, fontsize=9, loc="upper left")

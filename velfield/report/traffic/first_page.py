@@ -3,12 +3,17 @@
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import duration_text, find_answers, queue_text
+from velfield.analysis.answers import DELAY_OF_PART, duration_text, ends_out_of_view, find_answers, queue_text
 from velfield.analysis.signals.cycles import queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.traffic.approaches import approach_delays, lane_names
 
 _PER_QUESTION = 3
+_EVENTS = {
+    "conflicts": "conflicts",
+    "u-turns": "U-turns",
+    "unusual": "against the traffic, or by a way that others avoid",
+}
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     def why(topic: str, otherwise: str) -> str:
         return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
 
-    events = [f"{topic}: {text}" for topic in ("conflicts", "u-turns", "unusual") for text in found.get(topic, [])[:1]]
+    events = [f"{name}: {text}" for topic, name in _EVENTS.items() for text in found.get(topic, [])[:1]]
     no_junction = "no junction of lanes was found"
     questions = (
         (
@@ -69,10 +74,15 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     return FirstPage(
         seen,
         tuple(
-            (question, tuple(lines[:_PER_QUESTION]) or (f"Not known: {why}.",)) for question, lines, why in questions
+            (question, (*lines[:_PER_QUESTION], *_more(lines)) or (f"Not known: {why}.",))
+            for question, lines, why in questions
         ),
         tuple(dict.fromkeys(withheld)),
     )
+
+
+def _more(lines: list[str]) -> tuple[str, ...]:
+    return (f"and {len(lines) - _PER_QUESTION} more, in the tables",) if len(lines) > _PER_QUESTION else ()
 
 
 def _waits(analysis: TrafficAnalysis) -> list[str]:
@@ -83,20 +93,22 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
         signal = analysis.signals.get(number)
         if analysis.junction_kind(number) not in ("intersection", "roundabout"):
             continue
-        parts = [
-            f"from {d.arm} {d.delay_s:.0f} s" + (f" (level of service {d.level})" if d.level else "")
-            for d in approach_delays(analysis, found)
-        ]
+        delays = approach_delays(analysis, found)
+        parts = [f"from {d.arm} {d.text}" for d in delays]
         names = lane_names(found)
         longest = max(
             ((q, s) for s in (signal.streams if signal else ()) for q in queues(s.stream, s.green_s)),
             key=lambda pair: pair[0].length_m,
             default=None,
         )
-        line = f"junction {number}: mean delay " + ", ".join(parts) if parts else f"junction {number}:"
+        part = DELAY_OF_PART if any(d.partly for d in delays) else ""
+        line = f"junction {number}: mean delay{part} " + ", ".join(parts) if parts else f"junction {number}:"
         if longest and longest[0].vehicles.value:
             lane = longest[1].stream.approach.lane
-            line += f"; longest queue {names.get(lane, f'lane {lane}')}: {queue_text(longest[0])}"
+            line += f"; longest queue in view {names.get(lane, f'lane {lane}')}: {queue_text(longest[0])}"
+            beyond = [s.stream.approach.lane for s in signal.streams if ends_out_of_view(s)] if signal else []
+            others = [names.get(other, f"lane {other}") for other in beyond if other != lane]
+            line += f"; others that end out of view: {', '.join(others)}" if others else ""
         if not line.endswith(":"):
             out.append(line)
     return out

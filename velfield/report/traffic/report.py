@@ -19,6 +19,10 @@ MAX_ROWS = 400
 """Rows of a table that are shown; the workbook and the JSON have all."""
 _WIDTH_IN, _PAGE_IN = 7.2, (8.27, 11.69)
 DPI = 130
+_TOP_IN, _FOOT_IN = 11.0, 0.4
+_WRAP, _LINE_IN = 118, 0.16
+"""Characters and height of a line of the answers."""
+BRACKETS = "In brackets: the 90 % interval, and n, the number of vehicles, cycles or events that it rests on."
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 1.5em auto; max-width: 58em; padding: 0 1em; color: #1b1f24 }
 h1 { line-height: 1.2; margin-bottom: 0.2em } h2 { margin: 1.6em 0 0.3em }
@@ -58,8 +62,7 @@ def report_html(
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Traffic analysis</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head><body>'
         f'<h1>Traffic analysis</h1><p class="seen">{escape(_seen(record, page))}</p>{"".join(pictures[:1])}'
-        f"<h2>Answers</h2><dl>{answers}</dl><p class='note'>In brackets: the 90 % interval, and n, the number of "
-        f"vehicles, cycles or events that it rests on.</p>{missing}{''.join(pictures[1:])}"
+        f"<h2>Answers</h2><dl>{answers}</dl><p class='note'>{BRACKETS}</p>{missing}{''.join(pictures[1:])}"
         f"<h2>Tables</h2><p class='note'>All rows are in analysis.xlsx and analysis.json.</p>{tables}</body></html>"
     )
 
@@ -87,53 +90,60 @@ def _picture(diagram: Diagram) -> str:
 
 def report_pdf(record: AnalysisRecord, page: FirstPage, diagrams: Sequence[Diagram]) -> bytes:
     """The first page and the diagrams as A4 pages, the same bytes for the same analysis."""
-    pages = [_front(record, page, diagrams[0])] if diagrams else []
-    left = 0.0
+    pages, y = _front(record, page, diagrams[0]) if diagrams else ([], 0.0)
     for diagram in diagrams[1:]:
-        needed = diagram.height_in + 1.2
-        if left < needed:
+        if y - diagram.height_in - 0.9 < _FOOT_IN:
             pages.append(new_figure(*_PAGE_IN))
-            left = _PAGE_IN[1] - 1.2
-        _place(pages[-1], diagram, left + 0.5)
-        left -= needed
+            y = _TOP_IN
+        y = _place(pages[-1], diagram, y) - 0.35
     return pages_bytes(pages)
 
 
-def _front(record: AnalysisRecord, page: FirstPage, place: Diagram) -> "Figure":
+def _front(record: AnalysisRecord, page: FirstPage, place: Diagram) -> tuple[list["Figure"], float]:
+    """The place and the answers, on as many pages as they need, and the height that is left on the last."""
     figure = new_figure(*_PAGE_IN)
+    pages = [figure]
     figure.text(0.08, 0.945, "Traffic analysis", fontsize=20, fontweight="bold")
     y = 0.925 * _PAGE_IN[1]
     for line in textwrap.wrap(_seen(record, page), 100):
         figure.text(0.08, y / _PAGE_IN[1], line, fontsize=10, parse_math=False)
         y -= 0.19
-    _place(figure, place, min(10.4, y + 0.1))
-    y = 4.75
-    for question, lines in page.sections:
-        y = _write(figure, question, y, bold=True)
-        for line in lines:
-            y = _write(figure, line, y, bold=False)
-        y -= 0.09
-        if y < 0.5:
-            break
-    return figure
+    y = _place(figure, place, y - 0.05) - 0.1
+    for question, lines in (*page.sections, ("", (BRACKETS,))):
+        for line, follows in ((question, lines[0]), *((line, "") for line in lines)):
+            if y - _LINE_IN * (len(_wrapped(line)) + len(_wrapped(follows))) < _FOOT_IN:
+                pages.append(new_figure(*_PAGE_IN))
+                y = _TOP_IN
+            y = _write(pages[-1], line, y, bold=line == question)
+        y -= 0.07
+    return pages, y - 0.2
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, _WRAP)
 
 
 def _write(figure: "Figure", text: str, y_in: float, *, bold: bool) -> float:
-    for line in textwrap.wrap(text, 108):
+    for line in _wrapped(text):
         weight, x = ("bold", 0.08) if bold else ("normal", 0.1)
-        figure.text(x, y_in / _PAGE_IN[1], line, fontsize=9, fontweight=weight, parse_math=False)
-        y_in -= 0.175
+        figure.text(x, y_in / _PAGE_IN[1], line, fontsize=8.5, fontweight=weight, parse_math=False)
+        y_in -= _LINE_IN
     return y_in
 
 
-def _place(figure: "Figure", diagram: Diagram, top_in: float) -> None:
-    """A diagram with its title and caption, from a height of the page downwards."""
+def _place(figure: "Figure", diagram: Diagram, top_in: float) -> float:
+    """A diagram with its title and caption, from a height of the page downwards; returns where it ends."""
     high = _PAGE_IN[1]
     figure.text(0.08, (top_in - 0.05) / high, diagram.title, fontsize=12, fontweight="bold")
-    bottom = top_in - 0.45 - diagram.height_in
-    diagram.draw(figure.add_axes((0.13, (bottom + 0.55) / high, 0.8, (diagram.height_in - 0.65) / high)))
-    for k, line in enumerate(textwrap.wrap(diagram.caption, 118)):
-        figure.text(0.08, (bottom - 0.02 - 0.15 * k) / high, line, fontsize=8, color="#4b545d")
+    bottom, below = top_in - 0.45 - diagram.height_in, 0.1 if diagram.bare else 0.55
+    if diagram.bare:
+        bottom += 0.65
+    diagram.draw(figure.add_axes((0.13, (bottom + below) / high, 0.8, (diagram.height_in - 0.65) / high)))
+    y = bottom - 0.02
+    for line in textwrap.wrap(diagram.caption, 118):
+        figure.text(0.08, y / high, line, fontsize=8, color="#4b545d")
+        y -= 0.15
+    return y
 
 
 def _table(table: AnalysisTable) -> str:
