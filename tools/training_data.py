@@ -146,7 +146,6 @@ def read_oriented(
     *,
     car_length_px: float | None,
     mixes: int = 0,
-    not_vehicles: Sequence[str] = ("person", "bicycle"),
     nominal_length_px: float | None = None,
 ) -> dict[str, list[LabelledImage]]:
     """Pictures of a folder by name, labelled with oriented boxes in its ``labels.csv``.
@@ -155,8 +154,6 @@ def read_oriented(
     ----------
     car_length_px
         Length of a car in the pictures, px; None: the median length of the labelled cars.
-    not_vehicles
-        Classes that are background; ``ignore`` and ``motorcycle`` are neither.
     nominal_length_px
         A length that stands for not measured.
     """
@@ -164,7 +161,7 @@ def read_oriented(
     if car_length_px is None:
         car_length_px = float(labels.loc[labels["class"] == "car", "length_px"].median())
     factor, rng, found = CAR_LENGTH_PX / car_length_px, np.random.default_rng(_SEED), {}
-    labels = labels[~labels["class"].isin(not_vehicles)]
+    labels = labels[~labels["class"].isin(["person", "bicycle"])]  # background
     for file in sorted([*folder.glob("*.jpg"), *folder.glob("*.png")]):
         rows = labels[labels["file"] == file.name]
         doubtful = rows["class"].isin(["ignore", "motorcycle"])

@@ -109,9 +109,9 @@ def test_detections_are_scored_in_the_frames_and_on_the_grid_of_the_truth() -> N
 def test_matching_is_one_to_one_with_the_smallest_total_distance() -> None:
     """Greedily, 0 would take the car at 4 and leave 6 without one within reach."""
     found, true = np.array([[0.0, 0.0], [6.0, 0.0]]), np.array([[4.0, 0.0], [-3.0, 0.0]])
-    assert _match(found, true, MATCH_PX).tolist() == [[0, 1], [1, 0]]
-    assert _match(found[:0], true, MATCH_PX).shape == (0, 2)
-    assert _match(found, true + 100.0, MATCH_PX).shape == (0, 2)
+    assert _match(found, true).tolist() == [[0, 1], [1, 0]]
+    assert _match(found[:0], true).shape == (0, 2)
+    assert _match(found, true + 100.0).shape == (0, 2)
 
 
 def test_a_homography_is_applied_with_its_division_and_none_is_the_identity() -> None:

@@ -71,7 +71,7 @@ def time_trackpy(plan: Plan, tracklets_s: float) -> str:
     return _compare("tracklets", tracklets_s, "trackpy, nearest neighbours alone", seconds)
 
 
-def time_accumulation(plan: Plan, tiles: int = 16) -> list[str]:
+def time_accumulation(plan: Plan) -> list[str]:
     """Lines on the field: the busiest tiles, beside histograms of the same pixels and velocities.
 
     Ours also shares a track's unit among its segments and spreads each over the velocity bins; theirs are given the
@@ -88,7 +88,7 @@ def time_accumulation(plan: Plan, tiles: int = 16) -> list[str]:
     by_tile = segments_by_tile(
         segments, shape=(grid.height_px, grid.width_px), tile_size=config.tile_size_px, radius_px=radius
     )
-    busiest = sorted(by_tile, key=lambda tile: -len(by_tile[tile]))[:tiles]
+    busiest = sorted(by_tile, key=lambda tile: -len(by_tile[tile]))[:16]
     side, ours, work = config.tile_size_px, 0.0, []
     for row, column in busiest:
         mine, origin = segments[by_tile[row, column]], (column * side, row * side)

@@ -1,4 +1,4 @@
-"""Sharpness, brightness and contrast of a frame: apart from its flags, which planning reads without numba."""
+"""Sharpness and brightness of a frame: apart from its flags, which planning reads without numba."""
 
 from dataclasses import dataclass
 
@@ -18,21 +18,18 @@ class FrameQuality:
         Standard deviation of the Laplacian, grey levels.
     brightness
         Mean grey level.
-    contrast
-        Standard deviation, grey levels.
     thumbnail
         (16, 16) float32, the frame scaled down, its mean removed: what `flag_outlier_frames` correlates.
     """
 
     sharpness: float
     brightness: float
-    contrast: float
     thumbnail: Float32Array
 
 
 def frame_quality(grey: GreyImage) -> FrameQuality:
     """Measure a grey frame, (h, w) uint8."""
-    mean, deviation = cv2.meanStdDev(grey)
+    mean, _ = cv2.meanStdDev(grey)
     _, sharpness = cv2.meanStdDev(cv2.Laplacian(grey, cv2.CV_16S))
     small = cv2.resize(grey, (16, 16), interpolation=cv2.INTER_AREA).astype(np.float32)
-    return FrameQuality(float(sharpness[0, 0]), float(mean[0, 0]), float(deviation[0, 0]), small - small.mean())
+    return FrameQuality(float(sharpness[0, 0]), float(mean[0, 0]), small - small.mean())

@@ -182,14 +182,13 @@ def score_detections(
     *,
     frame_of: Mapping[int, int] | None = None,
     to_truth: FloatArray | None = None,
-    match_px: float = MATCH_PX,
 ) -> DetectionScore:
     """Score detections (columns frame, x_px, y_px, orientation_rad; base px). ``frame_of``: run's frame -> flight's."""
     matches, n_detections, n_cars, n_moving = [], 0, 0, 0
     for frame, found in detections.groupby("frame"):
         cars = cars_near_frame(truth, flight_frame(frame, frame_of))
         xy = apply_homography(to_truth, found[["x_px", "y_px"]].to_numpy(dtype=np.float64))
-        pairs = _match(xy, cars[["x_base_px", "y_base_px"]].to_numpy(), match_px)
+        pairs = _match(xy, cars[["x_base_px", "y_base_px"]].to_numpy())
         evaluated = cars["evaluated"].to_numpy()
         ignored = ~evaluated[pairs[:, 1]]
         n_detections += len(xy) - int(ignored.sum())
@@ -226,16 +225,15 @@ def score_tracklets(
     *,
     frame_of: Mapping[int, int] | None = None,
     to_truth: FloatArray | None = None,
-    match_px: float = MATCH_PX,
 ) -> TrackletScore:
-    """Score tracklets: correct if all three detections are nearest to one vehicle, within ``match_px`` of it."""
+    """Score tracklets: correct if all three detections are nearest to one vehicle, within `MATCH_PX` of it."""
     frames = [np.array([flight_frame(f, frame_of) for f in tracklets[f"frame_{k}"]], dtype=np.int64) for k in range(3)]
     positions = [
         apply_homography(to_truth, tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64)) for k in range(3)
     ]
-    vehicles = np.stack([_nearest_vehicle(truth, f, xy, match_px) for f, xy in zip(frames, positions, strict=True)])
+    vehicles = np.stack([_nearest_vehicle(truth, f, xy) for f, xy in zip(frames, positions, strict=True)])
     right = _one_vehicle(vehicles)
-    touched = [_nearest_vehicle(truth, f, xy, match_px, along=True) for f, xy in zip(frames, positions, strict=True)]
+    touched = [_nearest_vehicle(truth, f, xy, along=True) for f, xy in zip(frames, positions, strict=True)]
     cars = truth.cars.set_index(["frame", "vehicle_id"])
     table = pd.DataFrame({"frame": frames[1], "vehicle_id": vehicles[1]})[right]
     here = cars.loc[pd.MultiIndex.from_frame(table)] if len(table) else cars.iloc[:0]
@@ -327,13 +325,13 @@ def cars_near_frame(truth: Truth, frame: int) -> pd.DataFrame:
     return evaluated.iloc[np.flatnonzero(near)].reset_index(drop=True)
 
 
-def _match(found: FloatArray, true: FloatArray, match_px: float) -> IntArray:
-    """Pairs (n, 2) of indices: the one-to-one assignment of minimum total distance, each within ``match_px``."""
+def _match(found: FloatArray, true: FloatArray) -> IntArray:
+    """Pairs (n, 2) of indices: the one-to-one assignment of minimum total distance, each within `MATCH_PX`."""
     if not len(found) or not len(true):
         return np.empty((0, 2), dtype=np.int64)
     distance = np.hypot(found[:, None, 0] - true[None, :, 0], found[:, None, 1] - true[None, :, 1])
-    a, b = linear_sum_assignment(np.where(distance <= match_px, distance, 1e6))
-    good = distance[a, b] <= match_px
+    a, b = linear_sum_assignment(np.where(distance <= MATCH_PX, distance, 1e6))
+    good = distance[a, b] <= MATCH_PX
     return np.column_stack([a[good], b[good]]).astype(np.int64)
 
 
@@ -342,18 +340,16 @@ def _one_vehicle(vehicles: IntArray) -> Mask:
     return np.asarray((vehicles[0] >= 0) & (vehicles[0] == vehicles[1]) & (vehicles[0] == vehicles[2]))
 
 
-def _nearest_vehicle(
-    truth: Truth, frame: IntArray, xy: FloatArray, match_px: float, *, along: bool = False
-) -> IntArray:
-    """(n,) the vehicle whose centre, or any position along it, is nearest and within ``match_px``; -1: none."""
+def _nearest_vehicle(truth: Truth, frame: IntArray, xy: FloatArray, *, along: bool = False) -> IntArray:
+    """(n,) the vehicle whose centre, or any position along it, is nearest and within `MATCH_PX`; -1: none."""
     out = np.full(len(xy), -1, dtype=np.int64)
     for f in np.unique(frame):
         cars = truth.cars[truth.cars["frame"] == f]
         here = np.flatnonzero(frame == f)
         if len(cars):
-            positions, vehicle = _along(cars, match_px) if along else (_centres(cars), cars["vehicle_id"].to_numpy())
+            positions, vehicle = _along(cars) if along else (_centres(cars), cars["vehicle_id"].to_numpy())
             distance, k = cKDTree(positions).query(xy[here])
-            out[here] = np.where(distance <= match_px, vehicle[np.minimum(k, len(vehicle) - 1)], -1)
+            out[here] = np.where(distance <= MATCH_PX, vehicle[np.minimum(k, len(vehicle) - 1)], -1)
     return out
 
 
@@ -361,9 +357,9 @@ def _centres(cars: pd.DataFrame) -> FloatArray:
     return cars[["x_base_px", "y_base_px"]].to_numpy(np.float64)
 
 
-def _along(cars: pd.DataFrame, match_px: float) -> tuple[FloatArray, IntArray]:
-    """Positions (m, 2) along the vehicles, ``match_px`` or more from the ends except the centre, and their vehicles."""
-    half = np.maximum(cars["length_px"].to_numpy(np.float64) / 2 - match_px, 0.0)
+def _along(cars: pd.DataFrame) -> tuple[FloatArray, IntArray]:
+    """Positions (m, 2) along the vehicles, `MATCH_PX` or more from the ends except the centre, and their vehicles."""
+    half = np.maximum(cars["length_px"].to_numpy(np.float64) / 2 - MATCH_PX, 0.0)
     steps = np.linspace(-1.0, 1.0, 13)  # 2 px apart on the longest bus
     axis = cars["orientation_rad"].to_numpy(np.float64)
     ahead = np.column_stack([np.cos(axis), np.sin(axis)]) * half[:, None]

@@ -20,9 +20,7 @@ WRITERS = 2
 """Threads that render and write; numba, OpenCV and NumPy release the interpreter lock."""
 
 
-def write_flight(
-    out: Path, config: SimulationConfig, progress: Callable[[int, int], None] | None = None, *, threads: int = WRITERS
-) -> Flight:
+def write_flight(out: Path, config: SimulationConfig, progress: Callable[[int, int], None] | None = None) -> Flight:
     """Write ``frames/`` or a clip, ``timestamps.csv``, ``base.png``, ``labels.csv`` and ``truth/`` into ``out``.
 
     Parameters
@@ -48,7 +46,7 @@ def write_flight(
         pd.concat(labels)[columns].round(3).to_csv(out / "labels.csv", index=False)
     save_truth(make_truth(flight), out / "truth")
     write = _write_frames if config.clip == "none" else _write_clip
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(WRITERS) as pool:
         try:
             for done, _ in enumerate(write(out, flight, names, pool), start=1):
                 if progress is not None:

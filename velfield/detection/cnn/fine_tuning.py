@@ -66,7 +66,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
         tasks,
     )
     evidence = merge_scores([part for _, parts in held_out for part in parts]) if held_out else None
-    threshold, curve = select_threshold(evidence, record.threshold, FOLDS_DESCRIPTION)
+    threshold, curve = select_threshold(evidence, record.threshold)
     if curve is not None:
         weight = count / (count + _PRIOR_CARS)
         threshold = weight * threshold + (1 - weight) * record.threshold
@@ -76,11 +76,9 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
     return found.model_copy(update={"attribution": record.attribution})
 
 
-def select_threshold(
-    evidence: HeldOutScores | None, default: float, description: str
-) -> tuple[float, PrecisionRecallCurve | None]:
+def select_threshold(evidence: HeldOutScores | None, default: float) -> tuple[float, PrecisionRecallCurve | None]:
     """Score threshold and precision-recall curve on held-out cars; the default where too few were held out."""
-    curve = None if evidence is None else precision_recall_curve(evidence, description)
+    curve = None if evidence is None else precision_recall_curve(evidence, FOLDS_DESCRIPTION)
     if curve is None or curve.operating_point is None:
         return default, None
     return curve.threshold[curve.operating_point], curve
