@@ -77,7 +77,7 @@ def made_once(factory: pytest.TempPathFactory, name: str) -> Iterator[tuple[Path
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated flight of a few seconds."""
-    from velfield.synthetic import write_flight
+    from velfield.synthetic.write import write_flight
 
     with made_once(tmp_path_factory, "flight") as (folder, there):
         if not there:

@@ -74,7 +74,7 @@ def main() -> None:
     from flows.launch import prepare_process
     from schemas.simulation import SimulationConfig
     from tests.small_flight import FRAMES
-    from velfield.synthetic import write_flight
+    from velfield.synthetic.write import write_flight
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--kills", type=int, default=50)

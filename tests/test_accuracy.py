@@ -9,7 +9,7 @@ from flows.runners import RunnerConfig
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
 from velfield.pipeline.configuration import resolve_config
-from velfield.synthetic import write_flight
+from velfield.synthetic.write import write_flight
 
 FRAMES = 64
 

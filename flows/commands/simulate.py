@@ -57,7 +57,7 @@ def write_simulation(
     """Write a simulated flight, or a clip of it, with progress."""
     from flows.console import Console
     from schemas.simulation import SimulationConfig
-    from velfield.synthetic import write_flight
+    from velfield.synthetic.write import write_flight
 
     width, height = parse_frame_size(size, "as 1280x960")
     console = Console("quiet" if quiet else "normal")

@@ -27,7 +27,7 @@ from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.stage import STAGES, stages_before
 from velfield.pipeline.units import prepare_stage, stage_units
 from velfield.sources.folder import list_images
-from velfield.synthetic import small_flight
+from velfield.synthetic.cases import small_flight
 from velfield.synthetic.flight import Flight
 
 KINDS = {

@@ -14,9 +14,9 @@ import numpy as np
 from schemas.simulation import SceneSimulation, SimulationConfig, TrafficSimulation
 from velfield.analysis.vehicle_classes import HEAVY
 from velfield.run.run import open_run
-from velfield.synthetic import write_flight
 from velfield.synthetic.run_score import RunScore, score_run
 from velfield.synthetic.truth import load_truth
+from velfield.synthetic.write import write_flight
 
 HEAVY_M = 6.5
 """Longer than any car or van of the simulator, shorter than any lorry."""

@@ -20,9 +20,9 @@ from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.stage import stages_before
 from velfield.run.frame_transforms import read_lens
-from velfield.synthetic import write_flight
 from velfield.synthetic.cases import lens_only
 from velfield.synthetic.truth import load_truth
+from velfield.synthetic.write import write_flight
 
 FRAMES, SIZE = 10, (960, 1280)
 

@@ -36,7 +36,7 @@ def main() -> None:
 
 def _simulate(flight: Path, frames: int, size: str) -> Path:
     from schemas.simulation import SimulationConfig
-    from velfield.synthetic import write_flight
+    from velfield.synthetic.write import write_flight
 
     width, height = (int(side) for side in size.split("x"))
     if not (flight / "truth").exists():

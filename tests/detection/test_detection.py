@@ -13,7 +13,8 @@ from velfield.detection.registry import shipped_detector, train_detector
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import rescale
-from velfield.synthetic import Flight, small_flight
+from velfield.synthetic.cases import small_flight
+from velfield.synthetic.flight import Flight
 
 SCALE = 0.92  # 16 px a car at 0.23 m a pixel
 PAPER = PaperConfig(rounds=120, feature_pool=800)

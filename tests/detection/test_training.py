@@ -18,7 +18,7 @@ from velfield.errors import InputError
 from velfield.pipeline.stages.labels import check_label_scale, check_vehicle_length, labelled_images
 from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
-from velfield.synthetic import small_flight
+from velfield.synthetic.cases import small_flight
 
 QUICK = ["--set", "detection.fine_tune_steps=6"]
 

@@ -140,7 +140,8 @@ def link_detections(path: Path) -> int:
     """Tracklets and tracks of detections that no detector would give."""
     from schemas.flight import TrackingConfig
     from velfield.tracking.association import FrameTable
-    from velfield.tracking.joins import GapLimits, assign_tracks, close_gaps, find_ends
+    from velfield.tracking.join_costs import GapLimits
+    from velfield.tracking.joins import assign_tracks, close_gaps, find_ends
     from velfield.tracking.tracklets import link_windows
 
     rng = np.random.default_rng(int.from_bytes(path.read_bytes()[:8].ljust(8), "little"))

@@ -106,7 +106,7 @@ def main() -> int:
     prepare_process(verbose=False)
     flight = given.folder / "flight"
     if not flight.exists():
-        from velfield.synthetic import write_flight
+        from velfield.synthetic.write import write_flight
 
         write_flight(flight, TINY)
     python = f"{platform.python_version()}, numpy {np.__version__}"

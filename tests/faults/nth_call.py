@@ -66,7 +66,7 @@ class Flight:
 
     def make(self, steps: Sequence[str] = STEPS) -> None:
         """The flight, where it is not there, and its unbroken run up to the last of the steps."""
-        from velfield.synthetic import write_flight
+        from velfield.synthetic.write import write_flight
 
         if not (self.folder / "flight").exists():
             write_flight(self.folder / "flight", TINY)

@@ -46,7 +46,7 @@ class Sample:
 def write_long_flight(folder: Path, frames: int, width: int, height: int, seed: int) -> None:
     """A flight of so many frames, there and back over a simulated one."""
     from schemas.simulation import SimulationConfig
-    from velfield.synthetic import write_flight
+    from velfield.synthetic.write import write_flight
 
     write_flight(folder / "simulated", SimulationConfig(frames=SIMULATED, width=width, height=height, seed=seed))
     names = sorted(path.name for path in (folder / "simulated/frames").iterdir())

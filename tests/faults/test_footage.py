@@ -30,7 +30,7 @@ from velfield.run.stores import open_registration
 from velfield.sources.images import read_grey_image
 from velfield.sources.source import probe
 from velfield.sources.video.corruption import BlockArtifactDetector
-from velfield.synthetic import small_flight
+from velfield.synthetic.cases import small_flight
 
 WARNED = FramesConfig()
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -12,7 +12,7 @@ from velfield.pipeline.stage import stages_before
 from velfield.run.commits import read_commits
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_registration
-from velfield.synthetic import write_flight
+from velfield.synthetic.write import write_flight
 
 STILL = CameraSimulation(drift_m=0, climb_share=0, turn_deg=0, tilt_deg=0, vibration_px=0)
 FRAMES = 10

@@ -17,9 +17,10 @@ from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.stage import stages_before
 from velfield.run.run import Run
-from velfield.synthetic import load_truth, write_flight
 from velfield.synthetic.cases import two_term_lens
 from velfield.synthetic.run_score import RunScore, score_run
+from velfield.synthetic.truth import load_truth
+from velfield.synthetic.write import write_flight
 
 SEED = 731
 FRAMES = 4

@@ -257,7 +257,7 @@ def test_commit_records_hold_counts_and_digests(whole: tuple[Path, RunSummary]) 
 def test_detections_of_another_detector_take_the_place_of_ours(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
 ) -> None:
-    from velfield.synthetic import load_truth
+    from velfield.synthetic.truth import load_truth
 
     cars = load_truth(flight).cars
     cars = cars[cars["visible"]]
@@ -290,7 +290,7 @@ def test_boxes_of_few_frames_unused_inputs_and_empty_maps_are_warned_of(flight: 
 
 def test_the_size_of_given_boxes_sets_the_working_scale(flight: Path, tmp_path: Path) -> None:
     """Where no ground sample distance is given; boxes without a size are warned of."""
-    from velfield.synthetic import load_truth
+    from velfield.synthetic.truth import load_truth
 
     cars = load_truth(flight).cars
     names = sorted(path.name for path in (flight / "frames").iterdir())

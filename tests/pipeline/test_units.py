@@ -10,7 +10,7 @@ from tests.small_flight import digests
 from velfield import open_run
 from velfield.pipeline.stage import STAGE
 from velfield.pipeline.verify import verify_run
-from velfield.synthetic import write_flight
+from velfield.synthetic.write import write_flight
 
 
 @pytest.fixture(scope="module")

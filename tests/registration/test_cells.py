@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from velfield.registration.warp import CELL_PX, extend_border, resample_cells
+from velfield.registration.resampling.cells import CELL_PX
+from velfield.registration.warp import extend_border, resample_cells
 
 
 @pytest.mark.parametrize("step", [16, 8])

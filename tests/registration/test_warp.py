@@ -8,8 +8,9 @@ from velfield.camera.lens import HarrisLens, pinhole
 from velfield.detection.frame import ComparableFrame
 from velfield.registration import warp
 from velfield.registration.background import NOT_COVERED, median_of_stack
+from velfield.registration.resampling.cells import CELL_PX
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
-from velfield.registration.warp import CELL_PX, Rectification, footprint, warp_to_base
+from velfield.registration.warp import Rectification, footprint, warp_to_base
 
 WIDTH, HEIGHT = 240, 180
 

@@ -7,12 +7,11 @@ import pytest
 import xarray as xr
 import zarr
 
-from velfield.errors import InputError
+from velfield.errors import InputError, StoreError
 from velfield.run.shards import decode_tile, encode_tile
 from velfield.run.stores import (
     HISTOGRAM,
     FrameStore,
-    StoreError,
     create_field,
     create_frames,
     create_registration,

@@ -16,7 +16,8 @@ from tests.media import drifting
 from velfield.errors import Failure, InputError
 from velfield.sources.capture_times import read_flight_start
 from velfield.sources.clips import clip_files, read_clips_telemetry, write_clip_list
-from velfield.sources.source import check_source, iter_frames, probe, select_frames
+from velfield.sources.selection import select_frames
+from velfield.sources.source import check_source, iter_frames, probe
 
 FRAMES = FramesConfig()
 

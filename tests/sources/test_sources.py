@@ -20,7 +20,8 @@ from velfield.errors import InputError
 from velfield.parallel import for_each_behind
 from velfield.sources.frames import SourceFrame
 from velfield.sources.quality import FrameFlag
-from velfield.sources.source import iter_frames, probe, select_frames
+from velfield.sources.selection import select_frames
+from velfield.sources.source import iter_frames, probe
 from velfield.sources.video import pauses
 
 ALL = FramesConfig()

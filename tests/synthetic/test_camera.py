@@ -15,16 +15,17 @@ from schemas.simulation import (
     TrafficSimulation,
 )
 from velfield.errors import InputError
-from velfield.synthetic import (
+from velfield.synthetic.cases import (
+    FLAT,
+    PINHOLE,
     homography_only,
     lens_and_wobble,
     lens_only,
-    simulate,
     small_flight,
     two_term_lens,
     vibration_and_drift,
 )
-from velfield.synthetic.cases import FLAT, PINHOLE
+from velfield.synthetic.flight import simulate
 
 EMPTY = TrafficSimulation(flow_veh_per_h=0, warm_up_s=0)
 SAME_SENSOR = OtherSensorSimulation(same_sensor=True, noise_grey=0)

@@ -11,17 +11,10 @@ import pytest
 
 from schemas.simulation import CameraSimulation, SimulationConfig, TrafficSimulation
 from velfield.errors import InputError
-from velfield.synthetic import (
-    fit_homography,
-    load_truth,
-    make_truth,
-    score_field,
-    score_registration,
-    small_flight,
-    write_flight,
-)
-from velfield.synthetic.cases import FLAT
-from velfield.synthetic.truth import CAR_COLUMNS, LanePath, Truth
+from velfield.synthetic.cases import FLAT, small_flight
+from velfield.synthetic.score import fit_homography, score_field, score_registration
+from velfield.synthetic.truth import CAR_COLUMNS, LanePath, Truth, load_truth, make_truth
+from velfield.synthetic.write import write_flight
 
 STEADY = CameraSimulation(noise_grey=0, motion_blur_px=0, exposure_share=0)
 

@@ -7,12 +7,11 @@ import pytest
 
 from schemas.arrays import Float32Array, FloatArray
 from schemas.simulation import OtherSensorSimulation, SceneSimulation, TrafficSimulation
-from velfield.synthetic import Flight, small_flight
 from velfield.synthetic.camera import Camera, Waves
-from velfield.synthetic.cases import FLAT, PINHOLE
+from velfield.synthetic.cases import FLAT, PINHOLE, small_flight
 from velfield.synthetic.city.ground import NOON, reach_map
 from velfield.synthetic.city.relief import Relief, make_relief
-from velfield.synthetic.flight import _motion_kernel
+from velfield.synthetic.flight import Flight, _motion_kernel
 from velfield.synthetic.other_sensor import FAR_PX, StaticScene, other_sensor_image
 from velfield.synthetic.render import (
     MIN_OCCLUDER_PX,

@@ -12,9 +12,8 @@ from schemas.arrays import FloatArray
 from schemas.simulation import CameraSimulation, SimulationConfig, TimesSimulation, TrafficSimulation
 from schemas.tables import TRACKLET_COLUMNS
 from tests.field_runs import flight as small_city
-from velfield.synthetic import small_flight
 from velfield.synthetic.camera import motion_waves, shake_waves
-from velfield.synthetic.cases import PINHOLE
+from velfield.synthetic.cases import PINHOLE, small_flight
 from velfield.synthetic.flight import Flight, frame_times
 from velfield.synthetic.observed import NO_ERRORS, Errors, observed_detections, observed_tracklets
 from velfield.synthetic.random_streams import RandomStream, random_generator

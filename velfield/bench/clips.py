@@ -8,8 +8,8 @@ import av
 
 from schemas.simulation import SimulationConfig
 from velfield.parallel import usable_processors
-from velfield.synthetic import write_flight
 from velfield.synthetic.clip import CLIP_NAME
+from velfield.synthetic.write import write_flight
 
 CLIPS: dict[str, tuple[int, int]] = {"1080p H.264": (1920, 1080), "4K H.264": (3840, 2160), "1080p H.265": (1920, 1080)}
 """Name -> width and height."""

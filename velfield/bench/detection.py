@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from velfield.detection.cnn.network import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
 from velfield.detection.detect import detect_frame
 from velfield.detection.interface import Detector
-from velfield.synthetic import small_flight
+from velfield.synthetic.cases import small_flight
 
 
 def _c2f(step: int, into: int, out: int, repeats: int) -> list[tuple[int, int, int, int]]:
@@ -88,12 +88,13 @@ def network_gflop(width: int, height: int) -> float:
     return flop(TOPOLOGY, 1.0)[0] * width * height / 1e9
 
 
-def matmul_gflops(size: int = 1024, side: int = 64) -> float:
+def matmul_gflops() -> float:
     """Speed of this machine in a product of float32 matrices, GFLOP/s; of one core where BLAS is limited to one thread.
 
     The faster of numpy's and onnxruntime's, which need not use the same instructions: where numpy's BLAS was held to
     those of an older processor, the network did more than its peak.
     """
+    size, side = 1024, 64
     a = np.ones((size, size), np.float32)
     by_numpy = 2.0 * size**3 / _fastest(lambda: a @ a, 7)
     channels = size // 2

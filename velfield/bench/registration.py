@@ -24,10 +24,10 @@ from velfield.pipeline.stage import stages_before
 from velfield.registration.transforms import as_points
 from velfield.run.frame_transforms import FrameTransforms
 from velfield.sources.images import read_grey_image
-from velfield.synthetic import cases, write_flight
+from velfield.synthetic import cases
 from velfield.synthetic.score import RegistrationScore, apply_homography, score_registration
 from velfield.synthetic.truth import Truth, load_truth
-from velfield.synthetic.write import frame_name
+from velfield.synthetic.write import frame_name, write_flight
 
 PointMap = Callable[[int, FloatArray], FloatArray]
 

@@ -5,10 +5,10 @@ import numpy as np
 
 from schemas.detector import CnnConfig
 from velfield.detection.samples import LabelledImage
-from velfield.synthetic import small_flight
+from velfield.synthetic.cases import small_flight
 
 
-def simulated_image(seed: int, size: tuple[int, int] = (640, 480), large_share: float | None = None) -> LabelledImage:
+def simulated_image(seed: int, large_share: float | None = None) -> LabelledImage:
     """A frame of a simulated city, its sun and its buildings drawn from the seed; ``large_share`` of it no cars."""
     rng = np.random.default_rng(seed)
     scene = {
@@ -17,7 +17,7 @@ def simulated_image(seed: int, size: tuple[int, int] = (640, 480), large_share: 
         "texture": float(rng.uniform(0.7, 1.6)),
     }
     traffic = {} if large_share is None else {"large_share": large_share}
-    flight = small_flight(frames=1, width=size[0], height=size[1], seed=seed, scene=scene, traffic=traffic)
+    flight = small_flight(frames=1, seed=seed, scene=scene, traffic=traffic)
     factor = 16.0 * flight.config.gsd_m / CnnConfig().car_length_m
     cars = flight.labels(0)[["x_px", "y_px", "orientation_rad", "length_px", "width_px"]].to_numpy(copy=True)
     cars[:, :2] = (cars[:, :2] + 0.5) * factor - 0.5

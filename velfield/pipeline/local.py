@@ -35,7 +35,7 @@ def compute_stages(plan: Plan, stages: Iterable[str] = tuple(STAGE)) -> None:
 
 def compile_kernels() -> None:
     """Run a tiny job on a simulated flight, from its first frame to its maps."""
-    from velfield.synthetic import write_flight
+    from velfield.synthetic.write import write_flight
 
     with tempfile.TemporaryDirectory(prefix="velfield-kernels-") as folder:
         flight = Path(folder) / "flight"

@@ -18,8 +18,9 @@ from velfield.run.commits import code_version, content_key, digest_bytes, digest
 from velfield.run.flight_record import check_format, read_flight_record
 from velfield.run.layout import RunLayout, is_remote, to_path
 from velfield.sources.clips import CLIPS_SUFFIX, clip_files, read_clip_list, write_clip_list
-from velfield.sources.frames import local_path
-from velfield.sources.source import SourceInfo, check_source, probe, select_frames
+from velfield.sources.frames import SourceInfo, local_path
+from velfield.sources.selection import select_frames
+from velfield.sources.source import check_source, probe
 from velfield.sources.telemetry.find import find_beside
 
 _MANY_GAPS = 0.3

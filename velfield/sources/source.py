@@ -1,4 +1,4 @@
-"""One interface to videos and image folders: `probe` it, choose frames (`select_frames`), read them (`iter_frames`)."""
+"""One interface to videos and image folders: `probe` it, choose frames (`selection`), read them (`iter_frames`)."""
 
 from collections.abc import Generator, Sequence
 from contextlib import closing
@@ -16,13 +16,10 @@ from velfield.sources.folder import iter_folder, list_images, probe_folder
 from velfield.sources.frames import SourceFrame, SourceInfo, local_path
 from velfield.sources.images import describe_levels
 from velfield.sources.quality import FrameFlag, is_black, is_duplicate
-from velfield.sources.selection import select_frames
 from velfield.sources.video.corruption import libav_log
 from velfield.sources.video.decoding import iter_video, video_levels
 from velfield.sources.video.packets import open_video, video_stream
 from velfield.sources.video.probe import probe_video
-
-__all__ = ["SourceFrame", "SourceInfo", "check_source", "iter_frames", "probe", "select_frames"]
 
 
 def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = None) -> SourceInfo:

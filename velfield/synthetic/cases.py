@@ -4,11 +4,8 @@ import numpy as np
 
 from schemas.simulation import (
     CameraSimulation,
-    OtherSensorSimulation,
     SceneSimulation,
     SimulationConfig,
-    TimesSimulation,
-    TrafficSimulation,
 )
 from velfield.synthetic.camera import fold_radius
 from velfield.synthetic.flight import Flight, simulate
@@ -69,20 +66,3 @@ def small_flight(*, frames: int = 12, width: int = 640, height: int = 480, seed:
     """A small flight in memory for tests; ``sections`` (camera=..., scene=...) replace those of the configuration."""
     values: dict[str, object] = {"seed": seed, "frames": frames, "width": width, "height": height, **sections}
     return simulate(SimulationConfig.model_validate(values))
-
-
-__all__ = [
-    "FLAT",
-    "PINHOLE",
-    "CameraSimulation",
-    "OtherSensorSimulation",
-    "SceneSimulation",
-    "TimesSimulation",
-    "TrafficSimulation",
-    "homography_only",
-    "lens_and_wobble",
-    "lens_only",
-    "small_flight",
-    "two_term_lens",
-    "vibration_and_drift",
-]

@@ -30,11 +30,8 @@ from velfield.tracking.association import (
     mutual_best_links,
     tracklet_table,
     typical_difference,
-    window_frames,
 )
 from velfield.tracking.gates import DetectionStates, GateLog, Limits, LinkPairs, Links, gate_link_pairs, gate_links
-
-__all__ = ["FrameTable", "link_windows", "window_frames"]
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def speed(
 
 def _simulate(flight: Path, frames: int, width: int, height: int) -> Path:
     from schemas.simulation import SimulationConfig
-    from velfield.synthetic import write_flight
+    from velfield.synthetic.write import write_flight
 
     if not (flight / "truth").exists():
         write_flight(flight, SimulationConfig(frames=frames, width=width, height=height, seed=77))

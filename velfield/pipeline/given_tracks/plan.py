@@ -12,7 +12,7 @@ from velfield.pipeline.given_tracks.write import frame_times
 from velfield.pipeline.plan import Plan, check_same_flight
 from velfield.pipeline.stage import STAGES, Stage, stage_keys
 from velfield.run.commits import digest_path
-from velfield.sources.source import SourceInfo
+from velfield.sources.frames import SourceInfo
 
 TRACKS = "tracks"
 """Kind of the source of such a run."""

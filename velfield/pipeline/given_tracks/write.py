@@ -28,7 +28,7 @@ from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import conform, empty_table, write_table, write_tracks
 from velfield.sources.geo import BaseRaster
-from velfield.sources.source import select_frames
+from velfield.sources.selection import select_frames
 
 _STEP_S = 0.2
 _GAPS = 2.5
