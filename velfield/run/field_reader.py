@@ -84,7 +84,7 @@ def field_from_store(
     )
 
 
-def tile_reader(store: FieldStore, histogram: str = HISTOGRAM) -> TileSource:
+def tile_reader(store: FieldStore, histogram: str) -> TileSource:
     """A reader of whole tiles: a histogram, and the layers that are sums."""
     sums = {name: store.layer(name) for name in ("count", "occupancy_ms", "velocity_variance_sum")}
     side = store.tile

@@ -82,7 +82,7 @@ def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
     return _to_base_raster(file, raster, config.max_pixels)
 
 
-def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *, name: str = "base image") -> float:
+def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *, name: str) -> float:
     """Metres a pixel on the ground at the image's centre, by the reference system's local scale.
 
     Measured on the ellipsoid between pixels around the centre, which is right for Web Mercator (18 % too large at 32
@@ -220,7 +220,7 @@ def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
     return _with_georeference(path, _Raster(grey, valid), crs, affine, points)
 
 
-def _with_georeference(path: Path, raster: _Raster, crs: CRS | None, affine: Affine, points: int = 0) -> _Raster:
+def _with_georeference(path: Path, raster: _Raster, crs: CRS | None, affine: Affine, points: int) -> _Raster:
     """The image with the georeference that is there, or with a note why it is not used."""
     crs = crs if crs is not None else _prj(path)
     if affine.is_identity:

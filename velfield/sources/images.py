@@ -181,7 +181,7 @@ def _image_plugin(path: Path) -> type:
     raise InputError(f"{path.name}: found the bytes {head[:4].hex(' ')} at its start, expected {_READ}; convert it")
 
 
-def _to_grey(path: Path, image: Image.Image, levels: Levels | None = None) -> GreyImage:
+def _to_grey(path: Path, image: Image.Image, levels: Levels | None) -> GreyImage:
     mode = image.mode
     deep = _deep_values(path, image)
     if deep is not None:

@@ -128,7 +128,7 @@ def _with_orientations(sample: LabelledImage) -> LabelledImage:
     return replace(sample, cars=fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad))
 
 
-def _sample_patch(sample: LabelledImage, rng: np.random.Generator, *, hard: bool = False) -> Patch:
+def _sample_patch(sample: LabelledImage, rng: np.random.Generator, *, hard: bool) -> Patch:
     matrix = _random_similarity(sample, rng, large_weight=_LARGE_WEIGHT if hard else 1.0)
     rows, columns, window_matrix = _source_window(matrix, sample.image.shape)
     image = sample.image[rows, columns].astype(np.float32)
@@ -276,7 +276,7 @@ def highest_gaussians(vehicles: FloatArray) -> tuple[Float32Array, IntArray]:
     return heatmap, number
 
 
-def _augment_photometry(patch: Float32Array, rng: np.random.Generator, *, hard: bool = False) -> Float32Array:
+def _augment_photometry(patch: Float32Array, rng: np.random.Generator, *, hard: bool) -> Float32Array:
     """Photometric augmentation: gamma, contrast, brightness, blur, shadow, noise; grey stays in [0, 1].
 
     ``hard`` adds inverted polarity, haze and the losses of video.

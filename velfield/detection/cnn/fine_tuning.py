@@ -103,7 +103,7 @@ def _fine_tune_fold(
     config: CnnConfig,
     fold: int | None,
     *,
-    halves_at_once: bool = True,
+    halves_at_once: bool,
 ) -> tuple[Network, list[HeldOutScores]]:
     """Fine-tune without a fold's stripes and evaluate on them; without a fold, fine-tune on everything."""
     steps, seed = config.fine_tune_steps, config.seed
