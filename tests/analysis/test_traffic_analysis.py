@@ -101,6 +101,29 @@ def test_turning_counts_and_shares(analysis: TrafficAnalysis) -> None:
     assert found["N", "S"].delay_s is None
 
 
+def test_a_few_starts_that_recur_show_a_signal_but_not_at_a_roundabout(analysis: TrafficAnalysis) -> None:
+    seen = np.array([[-30.0, 4 * CYCLE_S]])
+    streams = [
+        replace(
+            s,
+            head_time_s=s.head_time_s[s.head_time_s < seen[0, 1]],
+            head_track=s.head_track[s.head_time_s < seen[0, 1]],
+        )
+        for s in next(streams for streams in analysis.streams.values() if len(streams) == 2)
+    ]
+    assert find_signal(0, streams, seen).signalised
+    found = find_signal(0, streams, seen, roundabout=True)
+    assert found.signalised is None
+    assert "16 needed" in found.reason
+
+
+def test_one_early_and_one_late_start_make_no_phase_of_their_own() -> None:
+    prompt = 6.0 + 60.0 * np.arange(4.0)
+    early, late = np.array([65.7, 119.3, 186.5]), np.sort(np.append(prompt, 137.1))
+    _, phases = fit_phases([prompt, late, early, prompt + 31.0], 60.0)
+    assert [set(phase.streams) for phase in phases] == [{0, 1, 2}, {3}]
+
+
 def test_who_waits_far_before_a_junction_is_delayed_too() -> None:
     """Every other vehicle from the west stands 100 m before the junction for 20 s; it loses 5 s to brake and start."""
     tracks = [drive(EAST, 9.0 * k) for k in range(12)]

@@ -129,7 +129,7 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
     kinds = {j.junction.number: analysis.junction_kind(j.junction.number) for j in analysis.movements}
     # Where lanes merge there is no choice.
     found = [m for j in analysis.movements if kinds[j.junction.number] != "merge" for m in j.movements]
-    for m in sorted(found, key=lambda m: -(m.seen + m.inferred)):
+    for m in sorted(found, key=lambda m: (not analysis.ways_meet(m.junction), -(m.seen + m.inferred))):
         share = f", {estimate_text(m.share, '%', 100)} of those from {m.arm_in}" if m.share else ""
         partly = DELAY_OF_PART if analysis.delay_is_partial(m.junction, m.arm_in) else ""
         delay = f", delay {estimate_text(m.delay_s, 's')}{partly}" if m.delay_s else ""
@@ -173,11 +173,12 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
         longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
-        text += f"; {lanes_text(lanes)}: green from {estimate_text(streams[0].green_phase_s, 's')} of it on"
         lasts = [(s.red_phase_s.value - s.green_phase_s.value) % signal.cycle_s.value for s in streams if s.red_phase_s]
-        text += f" for {min(lasts):.0f} s" if lasts else ""
+        long = f" for {min(lasts):.0f} s" if lasts else ""
+        begins = estimate_text(streams[0].green_phase_s, "s")
+        text += f"; {lanes_text(lanes)}: green{long} from {begins} into the cycle"
         if longest:
-            text += f", longest queue in view {queue_text(longest)}"
+            text += f", longest queue in view at green {queue_text(longest)}"
         beyond = [s.stream.approach.lane for s in streams if ends_out_of_view(s)]
         if beyond and longest and not longest.reaches_edge:
             text += f" ({lanes_text(beyond)}: out of view)"
@@ -272,7 +273,8 @@ def queue_text(queue: Queue) -> str:
     n = queue.vehicles
     if queue.reaches_edge:
         return f"at least {count_text(round(n.value), 'vehicle')}, {queue.length_m:.0f} m: it ends out of view"
-    return f"{count_text(round(n.value), 'vehicle')} ({n.low:.0f} to {n.high:.0f}), {queue.length_m:.0f} m"
+    ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
+    return f"{count_text(round(n.value), 'vehicle')}{ends}, {queue.length_m:.0f} m"
 
 
 def ends_out_of_view(stream: StreamSignal) -> bool:

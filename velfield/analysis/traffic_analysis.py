@@ -175,9 +175,9 @@ class TrafficAnalysis:
         Where lanes only merge, vehicles stop in the rhythm of the signals around.
         """
         return {
-            number: find_signal(number, streams, self.trajectories.observed_s)
+            number: find_signal(number, streams, self.trajectories.observed_s, roundabout=kind == "roundabout")
             for number, streams in self.streams.items()
-            if self.lanes.junctions[number].kind in ("intersection", "roundabout", "crossing")
+            if (kind := self.lanes.junctions[number].kind) in ("intersection", "roundabout", "crossing")
         }
 
     def is_signalised(self, junction: int) -> bool | None:
@@ -209,6 +209,11 @@ class TrafficAnalysis:
         level = [c.xy_m for c in self.conflicts if c.kind == "crossing" and c.on_one_level]
         on_one = self.is_signalised(junction) or bool(inside_hull(np.array(level).reshape(-1, 2), found.hull_m).any())
         return "intersection" if on_one else "crossing"
+
+    def ways_meet(self, junction: int) -> bool:
+        """Whether vehicles choose their way at a junction, and wait for each other: not where lanes merge or part, or
+        perhaps cross on two levels."""
+        return self.junction_kind(junction) in ("intersection", "roundabout")
 
     def profile(self, lane: int) -> list[Station]:
         """Speeds along a lane."""

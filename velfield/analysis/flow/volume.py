@@ -167,6 +167,20 @@ def _space_mean_speed(samples: LaneSamples) -> Estimate | None:
     return Estimate(ratio, max(ratio + off.low, 0.0), ratio + off.high, off.n) if off else None
 
 
+def delay_level(delay_s: Estimate, *, signalised: bool | None, partly: bool) -> str:
+    """Level of service of a mean delay: one, or those that its interval reaches; of a part of a delay the best one.
+
+    Examples
+    --------
+    >>> delay_level(Estimate(23.0, 17.0, 28.0, 53), signalised=True, partly=False)
+    'B to C'
+    """
+    best, worst = (level_of_service(max(end, 0.0), signalised=signalised) for end in (delay_s.low, delay_s.high))
+    if best and partly:
+        return f"{best} or worse"
+    return best if best == worst else f"{best} to {worst}"
+
+
 def level_of_service(delay_s: float, *, signalised: bool | None) -> str:
     """Level of service A to F by the control delay; empty where it is not known whether there is a signal.
 

@@ -18,7 +18,8 @@ MIN_STARTS = 2
 _JUNCTION_STARTS = 4
 """Fewest starts of queues of a junction, of at least two streams or of one that alone has so many."""
 _NO_CYCLE_STARTS, _NO_CYCLE_S = 16, 300.0
-"""With so many starts in so long a fixed cycle would show."""
+"""With so many starts in so long a fixed cycle would show. At a roundabout, where vehicles give way and signals are
+rare, fewer show no cycle: some recur by chance."""
 _FEW_STOP, _FEW_STOP_N, _FEW_STOP_S = 0.08, 60, 150.0
 """At a junction without a signal fewer stop than this share, with 95 % probability; all of a shorter clip may have come
 at green."""
@@ -95,7 +96,9 @@ class JunctionSignal:
     phases: tuple[tuple[int, ...], ...]
 
 
-def find_signal(junction: int, streams: Sequence[Stream], observed_s: FloatArray) -> JunctionSignal:
+def find_signal(
+    junction: int, streams: Sequence[Stream], observed_s: FloatArray, *, roundabout: bool = False
+) -> JunctionSignal:
     """The signal of a junction from its streams, seen in times (k, 2) from begins to ends.
 
     The cycle is that of the time with most starts of queues: over a gap, as between clips, its error would grow to a
@@ -111,14 +114,15 @@ def find_signal(junction: int, streams: Sequence[Stream], observed_s: FloatArray
     events = [times for _, times in by_time[main]] if counts else []
     n, duration = max(counts, default=0), float(np.diff(observed_s[main])[0]) if counts else 0.0
     stopped, share = _stopping(streams)
-    if n < _JUNCTION_STARTS:
+    needed = _NO_CYCLE_STARTS if roundabout else _JUNCTION_STARTS
+    if n < needed:
         few = share is not None and share.n >= _FEW_STOP_N and share.high < _FEW_STOP
-        if share is not None and few and sum(counts) < _JUNCTION_STARTS and np.diff(observed_s).sum() >= _FEW_STOP_S:
+        if share is not None and few and sum(counts) < needed and np.diff(observed_s).sum() >= _FEW_STOP_S:
             most = f"at most {100 * share.high:.1f} % stop"
             reason = f"no signal: {stopped} of {share.n} vehicles stopped, {most} with 95 % probability"
             return JunctionSignal(junction, False, reason, None, (), ())
         reason = (
-            f"too little data: {n} starts of queues that recur in a lane in {duration:.0f} s, {_JUNCTION_STARTS} "
+            f"too little data: {n} starts of queues that recur in a lane in {duration:.0f} s, {needed} "
             f"needed; {stopped} of {share.n if share else 0} vehicles stopped"
         )
         return JunctionSignal(junction, None, reason, None, (), ())

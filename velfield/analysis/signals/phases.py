@@ -47,7 +47,7 @@ def fit_phases(
     time_sd_s
         Standard deviation of a start by the errors of the tracks: smoothed speeds rise too early by about as much.
     """
-    groups = _group([_circular_mean(times, cycle_s) for times in starts_s], cycle_s)
+    groups = _group([_circular_median(times, cycle_s) for times in starts_s], cycle_s)
     number, time, group = _one_a_cycle(starts_s, groups, cycle_s)
     cycle = _fit_cycle(number, time, group)
     phases = []
@@ -63,8 +63,14 @@ def _circular_mean(times: FloatArray, cycle_s: float) -> float:
     return float(np.angle(np.exp(2j * np.pi * times / cycle_s).mean()) / (2 * np.pi) * cycle_s)
 
 
+def _circular_median(times: FloatArray, cycle_s: float) -> float:
+    """Phase of most starts: one that is late, of a vehicle that did not look, does not move it."""
+    mean = _circular_mean(times, cycle_s)
+    return mean + float(np.median(_wrap(times - mean, cycle_s)))
+
+
 def _group(phases_s: Sequence[float], cycle_s: float) -> list[list[int]]:
-    """Streams whose starts are together, by their mean phases."""
+    """Streams whose starts are together, by their phases."""
     groups: list[tuple[float, list[int]]] = []
     for k in np.argsort(phases_s).tolist():
         for at, members in groups:

@@ -54,7 +54,7 @@ def utdf(analysis: TrafficAnalysis, *, height_m: float) -> str:
     nodes = [
         _Node(analysis, found, height_m)
         for found in analysis.movements
-        if analysis.junction_kind(found.junction.number) in ("intersection", "roundabout") and found.movements
+        if analysis.ways_meet(found.junction.number) and found.movements
     ]
     if not nodes:
         raise InputError(

@@ -10,7 +10,7 @@ from schemas.export import SpeedUnit
 from velfield.analysis.answers import TWO_LEVELS
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
-from velfield.analysis.flow.volume import LaneFlow, level_of_service
+from velfield.analysis.flow.volume import LaneFlow, delay_level
 from velfield.analysis.lanes.model import Lane
 from velfield.analysis.movements.movements import JunctionMovements, Movement
 from velfield.analysis.movements.reversals import Reversal
@@ -99,11 +99,11 @@ def profile_table(analysis: TrafficAnalysis) -> AnalysisTable:
 def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Turning counts."""
 
-    def service(found: JunctionMovements, m: Movement) -> str | None:
+    def service(m: Movement) -> str | None:
         if m.delay_s is None:
             return None
-        level = level_of_service(m.delay_s.value, signalised=analysis.is_signalised(found.junction.number))
-        return f"{level} or worse" if level and analysis.delay_is_partial(m.junction, m.arm_in) else level or None
+        signalised, part = analysis.is_signalised(m.junction), analysis.delay_is_partial(m.junction, m.arm_in)
+        return delay_level(m.delay_s, signalised=signalised, partly=part) or None
 
     def partly(m: Movement) -> str:
         return "yes" if m.delay_s and analysis.delay_is_partial(m.junction, m.arm_in) else ""
@@ -122,7 +122,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("travel_time", "Travel time", "s", lambda row: row[1].travel_time_s),
         estimates("delay", "Delay", "s", lambda row: row[1].delay_s),
         Column("delay_of_part", "Queues end out of view", "", lambda row: partly(row[1])),
-        Column("los", "Level of service", "", lambda row: service(*row)),
+        Column("los", "Level of service", "", lambda row: service(row[1])),
     ]
     rows = ((found, m) for found in analysis.movements for m in found.movements)
     note = (

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.export import PER_M_PER_S, SpeedUnit
+from velfield.analysis.answers import count_text
 from velfield.analysis.flow.conflicts import LIKELY
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.movements.movements import MIN_PASSES, JunctionMovements
@@ -50,19 +51,24 @@ def traffic_diagrams(
     analysis: TrafficAnalysis, picture: GreyImage | None, *, unit: SpeedUnit = "km/h"
 ) -> Iterator[Diagram]:
     """The diagrams that the data allow: the place first, then junctions, signals, speeds, flows and conflicts."""
+    kinds = {analysis.junction_kind(junction.number) for junction in analysis.lanes.junctions}
     yield Diagram(
         "place",
         "The place",
         "Lanes with their direction of travel and their numbers; J: junctions, small where lanes only merge or part; "
         "in red, the roads by which vehicles enter and leave, N at the top of the image. J3 is junction 3 in the text; "
-        "a junction's own arms are named likewise by the side that they lead to. "
-        "Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn.",
+        "a junction's own arms are named likewise by the side that they lead to."
+        + (
+            " Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn."
+            if "crossing" in kinds
+            else ""
+        ),
         partial(draw_place, analysis=analysis, picture=picture),
         4.3,
         bare=True,
     )
     junctions = sorted(
-        (m for m in analysis.movements if _is_junction(analysis, m.junction.number) and m.movements),
+        (m for m in analysis.movements if analysis.ways_meet(m.junction.number) and m.movements),
         key=lambda found: -found.volume,
     )[:_MAX_JUNCTIONS]
     for found in junctions:
@@ -95,7 +101,7 @@ def traffic_diagrams(
         yield Diagram(
             "conflicts",
             "Where vehicles come near to each other",
-            f"{len(likely)} pairs that are within 1.5 s of a collision, or of each other, with a probability of "
+            f"{count_text(len(likely), 'pair')} within 1.5 s of a collision, or of each other, with a probability of "
             f"{LIKELY} or more.",
             partial(draw_conflicts, analysis=analysis, picture=picture),
             4.6,
@@ -103,17 +109,14 @@ def traffic_diagrams(
         )
 
 
-def _is_junction(analysis: TrafficAnalysis, number: int) -> bool:
-    return analysis.junction_kind(number) in ("intersection", "roundabout")
-
-
 def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Diagram]:
     signal = analysis.signals.get(found.junction.number)
     streams = [s for s in signal.streams if s.stream.stop_line_m is not None] if signal else []
+    streams.sort(key=lambda s: -len(s.stream.stop_track))
     if not streams:
         return
     number, names = found.junction.number, lane_names(found)
-    busiest = max(streams, key=lambda s: len(s.stream.stop_track))
+    busiest = streams[0]
     name = names.get(busiest.stream.approach.lane, f"lane {busiest.stream.approach.lane}")
     yield Diagram(
         f"time-space-{number}",
@@ -125,7 +128,8 @@ def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Ite
     yield Diagram(
         f"queue-{number}",
         f"Junction {number}: queues against time",
-        "Vehicles that stand from the stop line on, to the first gap: none from green on, when those at the line go.",
+        "Vehicles that stand from the stop line on, to the first gap: none some seconds after green, when those at the "
+        "line have gone.",
         partial(draw_queues, analysis=analysis, streams=streams, names=names),
     )
 
@@ -275,15 +279,15 @@ def _bezier(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Float
 def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
     """Delay by approach with levels of service."""
     limits = delays[0].limits_s
-    top = max(max(d.high_s for d in delays) * 1.8, *limits[1:2])
+    top = max(max(d.delay_s.high for d in delays) * 1.8, *limits[1:2])
     for limit in limits:
         if limit < top:
             axes.axvline(limit, color="#8a929b", linestyle="--", linewidth=0.8, zorder=0)
     for k, delay in enumerate(delays):
-        axes.barh(k, delay.delay_s, color="#5b6770", height=0.6)
-        axes.plot([delay.low_s, delay.high_s], [k, k], color="#1b1f24", linewidth=1.5)
-        label = f"{delay.level_text}   {delay.delay_s:.0f} s, of {delay.n} vehicles"
-        axes.text(delay.high_s + 0.01 * top, k, label, va="center", fontsize=9, fontweight="bold",
+        axes.barh(k, delay.delay_s.value, color="#5b6770", height=0.6)
+        axes.plot([delay.delay_s.low, delay.delay_s.high], [k, k], color="#1b1f24", linewidth=1.5)
+        label = f"{delay.level}   {delay.delay_s.value:.0f} s, of {delay.delay_s.n} vehicles"
+        axes.text(delay.delay_s.high + 0.01 * top, k, label, va="center", fontsize=9, fontweight="bold",
                   bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
     axes.set(yticks=range(len(delays)), yticklabels=[f"from {d.arm}" for d in delays], xlabel="delay, s", xlim=(0, top))
     axes.invert_yaxis()
@@ -372,8 +376,8 @@ def fundamental_points(analysis: TrafficAnalysis) -> FloatArray:
 
 def draw_fundamental(axes: "Axes", *, points: FloatArray, per_m_per_s: float, unit: SpeedUnit) -> None:
     """Flow against density, the lanes apart by their marks; a lane's speed is the slope from the origin."""
-    lanes, counts = np.unique(points[:, 0], return_counts=True)
-    shown = lanes[np.argsort(-counts, kind="stable")][: len(_MARKS)]
+    lanes, of = np.unique(points[:, 0], return_inverse=True)
+    shown = lanes[np.argsort(-np.bincount(of, points[:, 2]), kind="stable")][: len(_MARKS)]  # with the most vehicles
     for k, lane in enumerate(shown):
         mine = points[points[:, 0] == lane]
         axes.plot(mine[:, 1], mine[:, 2], _MARKS[k], color=_TONES[k], markersize=5, alpha=0.8, label=f"lane {lane:.0f}")

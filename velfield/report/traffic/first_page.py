@@ -3,7 +3,14 @@
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import DELAY_OF_PART, duration_text, ends_out_of_view, find_answers, queue_text
+from velfield.analysis.answers import (
+    DELAY_OF_PART,
+    duration_text,
+    ends_out_of_view,
+    find_answers,
+    lanes_text,
+    queue_text,
+)
 from velfield.analysis.signals.cycles import queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.traffic.approaches import approach_delays, lane_names
@@ -82,7 +89,9 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
 
 
 def _more(lines: list[str]) -> tuple[str, ...]:
-    return (f"and {len(lines) - _PER_QUESTION} more, in the tables",) if len(lines) > _PER_QUESTION else ()
+    return (
+        (f"and {len(lines) - _PER_QUESTION} more, in the tables of report.html",) if len(lines) > _PER_QUESTION else ()
+    )
 
 
 def _waits(analysis: TrafficAnalysis) -> list[str]:
@@ -91,7 +100,7 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
     for found in sorted(analysis.movements, key=lambda m: -m.volume):
         number = found.junction.number
         signal = analysis.signals.get(number)
-        if analysis.junction_kind(number) not in ("intersection", "roundabout"):
+        if not analysis.ways_meet(number):
             continue
         delays = approach_delays(analysis, found)
         parts = [f"from {d.arm} {d.text}" for d in delays]
@@ -102,13 +111,17 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
             default=None,
         )
         part = DELAY_OF_PART if any(d.partly for d in delays) else ""
-        line = f"junction {number}: mean delay{part} " + ", ".join(parts) if parts else f"junction {number}:"
+        said = [f"mean delay{part} " + ", ".join(parts)] if parts else []
+        silent = {m.arm_in for m in found.movements} - {d.arm for d in delays}
+        said += (
+            [f"delay from {', '.join(sorted(silent))} not known: few were seen for 60 m"] if parts and silent else []
+        )
         if longest and longest[0].vehicles.value:
             lane = longest[1].stream.approach.lane
-            line += f"; longest queue in view {names.get(lane, f'lane {lane}')}: {queue_text(longest[0])}"
+            said.append(f"longest queue at green in view {names.get(lane, f'lane {lane}')}: {queue_text(longest[0])}")
             beyond = [s.stream.approach.lane for s in signal.streams if ends_out_of_view(s)] if signal else []
-            others = [names.get(other, f"lane {other}") for other in beyond if other != lane]
-            line += f"; others that end out of view: {', '.join(others)}" if others else ""
-        if not line.endswith(":"):
-            out.append(line)
+            others = [other for other in beyond if other != lane]
+            said += [f"out of view end those of {lanes_text(others)} too"] if others else []
+        if said:
+            out.append(f"junction {number}: " + "; ".join(said))
     return out
