@@ -105,11 +105,12 @@ def lane_flow(
     between = (length + np.r_[length[:1], length[:-1]]) / 2  # the leader's rear half, the follower's front half
     gap = headway[follows] - between[follows] / np.maximum(passing.speed_m_per_s[follows], 1.0)
     enough = len(passing) >= 5
+    driven, spent, at = _by_track(traffic.samples(lane))
     return LaneFlow(
         lane,
         estimate_rate(by_slice.slices.sums(passing.time_s), by_slice.slices.hours),
-        _density(by_slice) if enough else None,
-        _space_mean_speed(traffic.samples(lane)),
+        _density(by_slice.density_veh_per_km, spent, at) if enough else None,
+        _space_mean_speed(driven, spent, at),
         estimate_mean(headway),
         estimate_median(gap[gap > 0], passing.time_s[follows][gap > 0]),
     )
@@ -131,14 +132,10 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
     return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed, samples)
 
 
-def _density(by_slice: FlowSlices) -> Estimate | None:
-    """Mean density. A few slices may be alike by chance: how much vehicles that come by chance, each for its own time,
-    would make them differ counts for one more."""
-    density = by_slice.density_veh_per_km
-    rows, _, wait = _steps(by_slice.samples)
-    _, of = np.unique(by_slice.samples.track[rows], return_inverse=True)
-    spent = np.bincount(of, wait).astype(np.float64)
-    at = np.bincount(of, wait * by_slice.samples.time_s[rows]) / np.maximum(spent, 1e-9)
+def _density(density: FloatArray, spent: FloatArray, at: FloatArray) -> Estimate | None:
+    """Mean density of slices, whose vehicles spend times ``spent`` (n,) on the lane ``at`` times. A few slices may be
+    alike by chance: how much vehicles that come by chance, each for its own time, would make them differ counts for one
+    more."""
     if len(spent) < 2:
         return None
     clusters = len(spent) / max(independent_vehicles(spent, at), 2.0)
@@ -155,15 +152,20 @@ def _steps(samples: LaneSamples) -> tuple[IntArray, FloatArray, FloatArray]:
     return rows, step[rows], wait[rows]
 
 
-def _space_mean_speed(samples: LaneSamples) -> Estimate | None:
-    """Distance driven over time spent of all vehicles on a lane, by the ratio estimator."""
+def _by_track(samples: LaneSamples) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(tracks,) distance driven, time spent, and when, of the tracks on a lane, whose samples are by track."""
     rows, step, wait = _steps(samples)
-    tracks, of = np.unique(samples.track[rows], return_inverse=True)
-    driven, spent, at = (np.bincount(of, w, len(tracks)) for w in (step, wait, samples.time_s[rows] * wait))
-    if not len(tracks):
+    of = np.cumsum(np.diff(samples.track[rows], prepend=samples.track[rows[:1]]) != 0)
+    driven, spent, at = (np.bincount(of, w).astype(np.float64) for w in (step, wait, samples.time_s[rows] * wait))
+    return driven, spent, at / spent
+
+
+def _space_mean_speed(driven: FloatArray, spent: FloatArray, at: FloatArray) -> Estimate | None:
+    """Distance driven over time spent of all vehicles on a lane, by the ratio estimator."""
+    if not len(spent):
         return None
     ratio = float(driven.sum() / spent.sum())
-    off = estimate_mean((driven - ratio * spent) / spent.mean(), at / spent, spread=(_SPREAD * ratio, _SPREAD_N))
+    off = estimate_mean((driven - ratio * spent) / spent.mean(), at, spread=(_SPREAD * ratio, _SPREAD_N))
     return Estimate(ratio, max(ratio + off.low, 0.0), ratio + off.high, off.n) if off else None
 
 
