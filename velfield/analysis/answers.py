@@ -69,9 +69,11 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
         if analysis.junction_kind(number) == "crossing":
             yield Answer("signal", f"crossing {number}", "too little data", TWO_LEVELS)
         else:
-            yield _signal(number, signal)
+            yield _signal(analysis, signal)
     seconds = analysis.trajectories.duration_s
-    yield _events("u-turns", len(analysis.reversals), seconds)
+    yield _events(
+        "u-turns", len(analysis.reversals), seconds, _places([_near(analysis, r.xy_m) for r in analysis.reversals])
+    )
     yield _conflicts(analysis)
     yield _unusual(analysis)
 
@@ -164,8 +166,8 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
         yield Answer("mean speed", f"lane {lane}", "found", text, mean.in_units(PER_M_PER_S[unit]), unit)
 
 
-def _signal(number: int, signal: JunctionSignal) -> Answer:
-    subject = f"junction {number}"
+def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
+    subject = f"junction {signal.junction}"
     if not signal.signalised or signal.cycle_s is None:
         state: State = "too little data" if signal.signalised is None else "none"
         return Answer("signal", subject, state, signal.reason)
@@ -176,7 +178,11 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
         lasts = [(s.red_phase_s.value - s.green_phase_s.value) % signal.cycle_s.value for s in streams if s.red_phase_s]
         long = f" for {min(lasts):.0f} s" if lasts else ""
         begins = estimate_text(streams[0].green_phase_s, "s")
-        text += f"; {lanes_text(lanes)}: green{long} from {begins} into the cycle"
+        crossed = np.unique(np.concatenate([s.stream.cross_track for s in streams]))
+        text += (
+            f"; {_from_arms(analysis, signal.junction, lanes)}green{long} from {begins} into the cycle, "
+            f"{count_text(len(crossed), 'vehicle')} crossed"
+        )
         if longest:
             text += f", longest queue in view at green {queue_text(longest)}"
         beyond = [s.stream.approach.lane for s in streams if ends_out_of_view(s)]
@@ -185,11 +191,16 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 
+def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -> str:
+    """Where the lanes of a phase come from."""
+    gates = next(found.gates for found in analysis.movements if found.junction.number == junction)
+    arms = sorted({gates.arms[gate.arm].name for gate in gates.gates if gate.inwards and gate.lane in lanes})
+    return f"from {' and '.join(arms)} ({lanes_text(lanes)}): " if arms else f"{lanes_text(lanes)}: "
+
+
 def _conflicts(analysis: TrafficAnalysis) -> Answer:
     likely = [c for c in analysis.conflicts if c.likely]
-    where = [_near(analysis, c.xy_m) for c in likely]
-    pairs = [f"{c.kind} {at}" for c, at in zip(likely, where, strict=True)]
-    kinds = ", ".join(f"{pairs.count(pair)} {pair}" for pair in sorted(set(pairs)))
+    kinds = _places([f"{c.kind} {_near(analysis, c.xy_m)}" for c in likely])
     unclear = sum(c.on_unclear_levels for c in analysis.conflicts)
     if unclear and not likely:
         text = f"{count_text(unclear, 'pair')} below 1.5 s where it is not clear that the roads are on one level"
@@ -200,6 +211,17 @@ def _conflicts(analysis: TrafficAnalysis) -> Answer:
     return _events(
         "conflicts", len(likely), analysis.trajectories.duration_s, f"{kinds}, probably less than 1.5 s apart"
     )
+
+
+def _places(found: Sequence[str]) -> str:
+    """How many are where.
+
+    Examples
+    --------
+    >>> _places(["at junction 2", "between junctions", "at junction 2"])
+    '2 at junction 2, 1 between junctions'
+    """
+    return ", ".join(f"{found.count(place)} {place}" for place in sorted(set(found)))
 
 
 def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
