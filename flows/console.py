@@ -78,12 +78,14 @@ class StageBars:
 
     def add(self, name: str, label: str, steps: str = "steps") -> StageProgress:
         """A bar for a stage, by its name, what it is called, and what its steps are."""
-        first: tuple[float, int] | None = None  # what an earlier run had done says nothing of the time left
+        first = 0.0, 0, 0  # what an earlier run had done says nothing of the time left, nor what is not yet announced
 
         def log(done: int, total: int) -> None:
             nonlocal first
             now_s = time.monotonic()
-            begin_s, begun = first = first or (now_s, done)
+            if first[2] != total:
+                first = now_s, done, total
+            begin_s, begun, _ = first
             if self.log is not None and done < total and now_s - self.logged_s >= _LINE_EVERY_S:
                 self.logged_s = now_s
                 left_s = (now_s - begin_s) * (total - done) / (done - begun) if done > begun else None

@@ -110,7 +110,7 @@ class Work:
                 for stage in stages:
                     if self._beside is None:
                         self._restart_before(stage)
-                    steps = "frames" if stage.cut is Cut.BY_FRAMES else "parts"
+                    steps = "frames" if stage.cut is Cut.BY_FRAMES else "steps"
                     progress = bars.add(stage.name, stage.label, steps)
                     self._compute(self._start(stage, progress, essential), graph)
             except BaseException:
@@ -160,6 +160,7 @@ class Work:
         units = stage_units(self.plan, stage)
         total = sum(unit.steps for unit in units)
         progress.expect(total)
+        progress.at_least(sum(u.steps for u in units if committed(self.plan, stage.name, u.name) is not None))
         whole = stage.essential if essential is None else essential
         show = self.orchestration.show_progress(stage.name, total)
         under_way = UnderWay(stage, self.plan, units, whole, progress, show, time.monotonic())

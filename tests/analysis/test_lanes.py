@@ -9,7 +9,8 @@ from velfield.analysis.lanes.find import find_lanes, project
 from velfield.analysis.lanes.junctions import buffered_hull, inside_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.gates import find_gates
-from velfield.analysis.trajectories import from_tracklets
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import Trajectories, from_tracklets
 
 GSD_M = 0.25
 
@@ -27,9 +28,13 @@ def driven(corners: FloatArray, *, speed_m_per_s: float = 10.0) -> FloatArray:
 
 
 def graph_of(paths: list[FloatArray], *, sd_m: float = 0.2) -> LaneGraph:
+    return find_lanes(tracks_of(paths, sd_m=sd_m))
+
+
+def tracks_of(paths: list[FloatArray], *, sd_m: float = 0.2) -> Trajectories:
     rng = np.random.default_rng(5)
     noisy = [path + rng.normal(0, sd_m / GSD_M, (1, 2)) + rng.normal(0, 0.05 / GSD_M, path.shape) for path in paths]
-    return find_lanes(from_tracklets(tracklets_along(noisy), GSD_M))
+    return from_tracklets(tracklets_along(noisy), GSD_M)
 
 
 AVENUE = np.array([[0.0, 50.0], [150.0, 50.0]])
@@ -83,9 +88,13 @@ def test_a_circle_is_a_roundabout() -> None:
         )
         for turn, exit_ in ((100, onwards), (280, back))
     ]
-    graph = graph_of([driven(path, speed_m_per_s=6.0) for path in paths * 6], sd_m=0.1)
+    made = [driven(path, speed_m_per_s=6.0) for path in paths * 6]
+    analysis = TrafficAnalysis(tracks_of(made, sd_m=0.1))
+    graph = analysis.lanes
     (circle,) = (junction for junction in graph.junctions if junction.kind == "roundabout")
     gates = find_gates(graph, circle)
+    turns = {(m.arm_in, m.arm_out): m.turn for m in analysis.movements[circle.number].movements}
+    assert turns == {("W", "E"): "straight", ("E", "W"): "straight", ("W", "W"): "u-turn", ("E", "E"): "u-turn"}
     assert len(gates.arms) == 2  # a road's entry and its exit are one arm, though they diverge at the circle
     assert sorted((gate.arm, gate.inwards) for gate in gates.gates) == [(0, False), (0, True), (1, False), (1, True)]
 

@@ -139,6 +139,26 @@ def test_who_waits_far_before_a_junction_is_delayed_too() -> None:
     assert delay.value == pytest.approx(np.mean(lost_s) / 2, rel=0.15)
 
 
+def test_who_waits_at_the_junction_before_is_not_delayed_at_the_next() -> None:
+    """A crossing road 75 m before the junction: who stands there for 20 s is delayed there."""
+    before = np.array([[75.0, 0.0], [75.0, 220.0]])
+    west = corner(65.0, 100.0, 220.0)
+    tracks = [drive(EAST, 9.0 * k) for k in range(12)]
+    tracks += [drive(EAST, 9.0 * k + 3.0, stop_at_m=55.0, go_s=9.0 * k + 29.0) for k in range(12)]
+    tracks += [drive(path, 15.0 * k + 1.5) for path in (RIGHT, west) for k in range(5)]
+    tracks += [drive(path, 11.0 * k + 1.5) for path in (SOUTH, before) for k in range(10)]
+    analysis = TrafficAnalysis(gather(tracks))
+    found = sorted(
+        (j.junction.centre_m[0], m.delay_s)
+        for j in analysis.movements
+        for m in j.movements
+        if (m.arm_in, m.arm_out) == ("W", "E") and m.delay_s
+    )
+    (_, first), (_, second) = found
+    assert first.value > 8.0
+    assert second.value < 1.0
+
+
 def test_a_vehicle_that_stands_for_most_of_a_clip_does_not_outweigh_the_others() -> None:
     """Eleven vehicles of 6 s and one of 49 s in a clip of 60 s: 9.6 s in the mean, 12 s with those that were cut."""
     tracks = [drive(EAST, 3.5 * k - 3.0) for k in range(11)] + [drive(EAST, -2.0, stop_at_m=131.0, go_s=49.0)]
@@ -346,7 +366,9 @@ def test_a_vehicle_that_leaves_its_lane_and_comes_back_is_not_on_it_between() ->
 
 
 def test_a_vehicle_beside_the_lane_of_a_gate_does_not_cross_there() -> None:
-    gates = Gates((Gate(0, True, np.array([10.0, 5.0]), np.pi / 2, 0),), (Arm(0, "N", np.array([10.0, 5.0])),))
+    gates = Gates(
+        (Gate(0, True, np.array([10.0, 5.0]), np.pi / 2, 0),), (Arm(0, "N", np.array([10.0, 5.0]), -np.pi / 2),)
+    )
     at = np.array([[10.0, 5.5], [12.0, 5.0], [13.5, 5.0], [10.0, 12.0]])
     assert gates.nearest(at, np.full(4, np.pi / 2), inwards=True).tolist() == [0, 0, -1, -1]
     assert gates.nearest(at, np.full(4, -np.pi / 2), inwards=True).tolist() == [-1] * 4

@@ -2,6 +2,7 @@
 
 import json
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +15,7 @@ def test_a_log_gets_a_line_of_a_long_stage_now_and_then(
 ) -> None:
     monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
     now_s = [time.monotonic() + 1.0]
-    monkeypatch.setattr("flows.console.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("flows.console.time", SimpleNamespace(monotonic=lambda: now_s[0]))
     with Console().stages() as bars:
         progress = bars.add("detections", "detections", "frames")
         progress.expect(400)

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.intervals import Estimate, estimate_event_rate
-from velfield.analysis.signals.cycles import JunctionSignal, Queue, StreamSignal, queues
+from velfield.analysis.signals.cycles import JunctionSignal, Queue, ends_out_of_view, green_duration_s, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 
@@ -17,7 +17,7 @@ State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS = 60.0, 30
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
 DELAY_OF_PART = " in view"
-_AT_JUNCTION_M = 30.0
+_AT_JUNCTION_M = 20.0
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
 
@@ -175,8 +175,8 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
         longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
-        lasts = [(s.red_phase_s.value - s.green_phase_s.value) % signal.cycle_s.value for s in streams if s.red_phase_s]
-        long = f" for {min(lasts):.0f} s" if lasts else ""
+        lasts = green_duration_s(streams, signal.cycle_s.value)
+        long = f" and yellow for {lasts:.0f} s" if lasts else ""
         begins = estimate_text(streams[0].green_phase_s, "s")
         crossed = np.unique(np.concatenate([s.stream.cross_track for s in streams]))
         text += (
@@ -187,7 +187,7 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
             text += f", longest queue in view at green {queue_text(longest)}"
         beyond = [s.stream.approach.lane for s in streams if ends_out_of_view(s)]
         if beyond and longest and not longest.reaches_edge:
-            text += f" ({lanes_text(beyond)}: out of view)"
+            text += f" (those of {lanes_text(beyond)} end out of view)"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 
@@ -218,17 +218,17 @@ def _places(found: Sequence[str]) -> str:
 
     Examples
     --------
-    >>> _places(["at junction 2", "between junctions", "at junction 2"])
-    '2 at junction 2, 1 between junctions'
+    >>> _places(["at junction 2", "away from junctions", "at junction 2"])
+    '2 at junction 2, 1 away from junctions'
     """
     return ", ".join(f"{found.count(place)} {place}" for place in sorted(set(found)))
 
 
 def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
     """The place of an event: the junction near it, if one is."""
-    away = [(float(np.hypot(*(junction.centre_m - xy_m))), junction.number) for junction in analysis.lanes.junctions]
+    away = [(float(np.hypot(*(j.hull_m - xy_m).T).min()), j.number) for j in analysis.lanes.junctions]
     distance_m, number = min(away, default=(np.inf, 0))
-    return f"at {_place(analysis, number)}" if distance_m < _AT_JUNCTION_M else "between junctions"
+    return f"at {_place(analysis, number)}" if distance_m < _AT_JUNCTION_M else "away from junctions"
 
 
 def _unusual(analysis: TrafficAnalysis) -> Answer:
@@ -294,14 +294,9 @@ def queue_text(queue: Queue) -> str:
     """
     n = queue.vehicles
     if queue.reaches_edge:
-        return f"at least {count_text(round(n.value), 'vehicle')}, {queue.length_m:.0f} m: it ends out of view"
+        return f"at least {count_text(round(n.low), 'vehicle')}, {queue.length_m:.0f} m: it ends out of view"
     ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
     return f"{count_text(round(n.value), 'vehicle')}{ends}, {queue.length_m:.0f} m"
-
-
-def ends_out_of_view(stream: StreamSignal) -> bool:
-    """Whether a queue of a stream ends out of view at a green: how long it is is not known."""
-    return any(queue.reaches_edge for queue in queues(stream.stream, stream.green_s))
 
 
 def duration_text(seconds: float) -> str:

@@ -15,7 +15,7 @@ from schemas.arrays import FloatArray, IntArray
 from velfield.compiled import kernel
 
 LEVEL = 0.9
-_LEAST_EXPOSURE_H = 1 / 60
+_LEAST_EXPOSURE_H = 59 / 3600
 MIN_VEHICLES = 5
 """Fewer vehicles give no estimate."""
 _ALIKE_S = 5.0

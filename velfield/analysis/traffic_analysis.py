@@ -35,7 +35,7 @@ from velfield.analysis.movements.time_slices import (
     origins_by_slice,
     slice_edges,
 )
-from velfield.analysis.signals.cycles import JunctionSignal, find_signal, queues
+from velfield.analysis.signals.cycles import JunctionSignal, ends_out_of_view, find_signal
 from velfield.analysis.signals.queues import Stops, Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
@@ -187,13 +187,13 @@ class TrafficAnalysis:
 
     @cached_property
     def _queued_beyond(self) -> set[tuple[int, str]]:
-        """Junctions and arms whose queues end out of view at a green."""
+        """Junctions and arms whose queues end out of view at a green, of signals whose cycle is known."""
         out = set()
         for found in self.movements:
             arm = {gate.lane: found.gates.arms[gate.arm].name for gate in found.gates.gates if gate.inwards}
             signal = self.signals.get(found.junction.number)
             for one in signal.streams if signal else ():
-                if any(q.reaches_edge for q in queues(one.stream, one.green_s)):
+                if ends_out_of_view(one):
                     out.add((found.junction.number, arm.get(one.stream.approach.lane, "")))
         return out
 

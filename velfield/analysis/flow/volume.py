@@ -133,9 +133,8 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
 
 
 def _density(density: FloatArray, spent: FloatArray, at: FloatArray) -> Estimate | None:
-    """Mean density of slices, whose vehicles spend times ``spent`` (n,) on the lane ``at`` times. A few slices may be
-    alike by chance: how much vehicles that come by chance, each for its own time, would make them differ counts for one
-    more."""
+    """Mean density of slices. A few slices may be alike by chance, so one more is added to them, as far from their mean
+    as vehicles would bring it that come at random and each spend their time (n,) on the lane."""
     if len(spent) < 2:
         return None
     clusters = len(spent) / max(independent_vehicles(spent, at), 2.0)
@@ -178,7 +177,7 @@ def delay_level(delay_s: Estimate, *, signalised: bool | None, partly: bool) -> 
     'B to C'
     """
     best, worst = (level_of_service(max(end, 0.0), signalised=signalised) for end in (delay_s.low, delay_s.high))
-    if best and partly:
+    if best not in ("", "F") and partly:
         return f"{best} or worse"
     return best if best == worst else f"{best} to {worst}"
 

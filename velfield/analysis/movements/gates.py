@@ -34,11 +34,13 @@ class Gate:
 
 @dataclass(frozen=True)
 class Arm:
-    """A road that ends at a junction: ``name`` by the side of the image it leads to, its gates' middle ``xy_m``."""
+    """A road that ends at a junction: ``name`` by the side of the image it leads to, its gates' middle ``xy_m``,
+    ``outward_rad`` its direction away from the junction."""
 
     number: int
     name: str
     xy_m: FloatArray
+    outward_rad: float
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
             way = outside[np.abs(lane.along_m[outside] - lane.along_m[k]) < _ROAD_M]
             far = min(int(way[0] if inwards else way[-1]), len(lane.xy_m) - 2)
             roads.append((lane.number, inwards, *_middle(lane.xy_m, far)))
-    arms = group_gates(roads)
+    arms = group_gates(found, roads)
     numbers = sorted(set(arms.tolist()))
     middles = [
         np.mean([f[2] for f, arm in zip(found, arms, strict=True) if arm == number], axis=0) for number in numbers
@@ -90,7 +92,7 @@ def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
     rank = {numbers[k]: i for i, k in enumerate(order)}
     gates = tuple(Gate(*f, arm=rank[int(arm)]) for f, arm in zip(found, arms, strict=True))
     names = name_arms({i: outward[k] for i, k in enumerate(order)}, {i: middles[k] for i, k in enumerate(order)})
-    return Gates(gates, tuple(Arm(i, names[i], middles[k]) for i, k in enumerate(order)))
+    return Gates(gates, tuple(Arm(i, names[i], middles[k], outward[k]) for i, k in enumerate(order)))
 
 
 def _middle(xy_m: FloatArray, k: int) -> tuple[FloatArray, float]:
@@ -104,23 +106,27 @@ def _outward(gates: list[tuple[int, bool, FloatArray, float]]) -> float:
     return float(np.angle(sum(np.exp(1j * (direction + np.pi * inwards)) for _, inwards, _, direction in gates)))
 
 
-def group_gates(found: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
+def group_gates(*places: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
     """Number of each gate's arm: gates near each other, of one axis, are of one arm.
 
     Parameters
     ----------
-    found
-        For each gate: its lane, whether it leads inwards, its position, m, and its direction, rad.
+    places
+        For each gate: its lane, whether it leads inwards, its position, m, and its direction, rad. Of several such
+        lists gates are of one arm that are near each other in one of them.
     """
-    n = len(found)
+    n = len(places[0])
     label = np.arange(n)
     for i in range(n):
         for j in range(i):
-            outward = found[i][3] + np.pi * found[i][1], found[j][3] + np.pi * found[j][1]
-            turn = abs(float(np.angle(np.exp(1j * (outward[0] - outward[1])))))
-            if np.hypot(*(found[i][2] - found[j][2])) < _ARM_M and turn < _ARM_RAD:
+            if any(_of_one_road(found[i], found[j]) for found in places):
                 label[label == label[i]] = label[j]
     return label
+
+
+def _of_one_road(a: tuple[int, bool, FloatArray, float], b: tuple[int, bool, FloatArray, float]) -> bool:
+    turn = abs(float(np.angle(np.exp(1j * (a[3] + np.pi * a[1] - b[3] - np.pi * b[1])))))
+    return bool(np.hypot(*(a[2] - b[2])) < _ARM_M and turn < _ARM_RAD)
 
 
 def name_arms(

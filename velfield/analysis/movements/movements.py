@@ -18,7 +18,7 @@ from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, 
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import Junction, LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
-from velfield.analysis.movements.gates import Gates, find_gates
+from velfield.analysis.movements.gates import Arm, Gates, find_gates
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
@@ -46,7 +46,8 @@ class Passes:
     """Tracks in a junction, one row a pass: gates by number, -1 where the track was not seen to enter (or leave).
 
     ``entry_s``, ``exit_s`` and ``upstream_s`` (``_UPSTREAM_M`` before the entry) are times, NaN where unknown;
-    ``farther_m`` and ``farther_s``: how far before that the track is seen, up to ``_FARTHER_M``, and for how long;
+    ``farther_m`` and ``farther_s``: how far before that the track is seen, up to ``_FARTHER_M`` and from the junction
+    before on, and for how long; ``farther_stood``: at some time there;
     ``joined``: of two tracks or more of one vehicle, of which ``track`` is the one that enters (or leaves);
     ``stood``: at some time between upstream and exit.
     """
@@ -61,6 +62,7 @@ class Passes:
     stood: Mask
     farther_m: FloatArray
     farther_s: FloatArray
+    farther_stood: Mask
 
     @property
     def travel_s(self) -> FloatArray:
@@ -139,24 +141,34 @@ def find_movements(
     cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
     samples = cut.samples
     slices = ObservedSlices.of(trajectories.observed_s, _SLICE_S)
+    ways_meet = [junction for junction in graph.junctions if junction.kind in ("intersection", "roundabout")]
+    waits_elsewhere = np.unique(np.concatenate([np.empty(0, np.int64), *(_inside(samples, j) for j in ways_meet)]))
     out = []
     for junction in graph.junctions:
         gates = find_gates(graph, junction)
-        passes = _within(_by_track(find_passes(samples, junction, gates), cut), *trajectories.window_s)
+        passes = find_passes(samples, junction, gates, waits_elsewhere)
+        passes = _within(_by_track(passes, cut), *trajectories.window_s)
         movements = tuple(_count(junction, gates, passes, slices, trajectories.observed_s))
         out.append(JunctionMovements(junction, gates, passes, movements))
     return tuple(out)
 
 
-def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passes:
-    """Tracks in the area of a junction."""
-    low, high = junction.hull_m.min(axis=0), junction.hull_m.max(axis=0)
-    near = within(samples.xy_m, low, high)
-    inside = near[inside_hull(samples.xy_m[near], junction.hull_m)]
+def _inside(samples: PathSamples, junction: Junction) -> IntArray:
+    """Rows of the samples in the area of a junction."""
+    near = within(samples.xy_m, junction.hull_m.min(axis=0), junction.hull_m.max(axis=0))
+    return near[inside_hull(samples.xy_m[near], junction.hull_m)]
+
+
+def find_passes(
+    samples: PathSamples, junction: Junction, gates: Gates, waits_elsewhere: IntArray | None = None
+) -> Passes:
+    """Tracks in the area of a junction; ``waits_elsewhere``: rows of the samples, in order, in areas where vehicles
+    wait for each other: delays begin behind the last one."""
+    inside = _inside(samples, junction)
     if not len(inside):
         none, number = np.empty(0), np.empty(0, np.int64)
         no = np.empty(0, bool)
-        return Passes(number, number, number, none, none, none, no, no, none, none)
+        return Passes(number, number, number, none, none, none, no, no, none, none, no)
     breaks = np.flatnonzero((np.diff(inside) > 1) | (np.diff(samples.track[inside]) != 0)) + 1
     first, last = inside[np.r_[0, breaks]], inside[np.r_[breaks - 1, len(inside) - 1]]
     enters = (first > 0) & (samples.track[np.maximum(first - 1, 0)] == samples.track[first])
@@ -167,7 +179,10 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
     up = np.maximum(first - _UPSTREAM_M, 0)
     reaches = enters & (samples.track[up] == samples.track[first])
     far = np.maximum(up - _FARTHER_M, np.searchsorted(samples.track, samples.track[first]))
-    far = np.where(reaches, far, up)
+    if waits_elsewhere is not None and len(waits_elsewhere):
+        before = np.searchsorted(waits_elsewhere, up, side="right") - 1
+        far = np.maximum(far, np.where(before >= 0, waits_elsewhere[before], -1) + 1)
+    far = np.where(reaches, np.minimum(far, up), up)
     waits = np.r_[0, np.cumsum(np.diff(samples.time_s) > _WAITS_S)]
     return Passes(
         samples.track[first],
@@ -180,6 +195,7 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
         reaches & (waits[last] > waits[up]),
         np.where(reaches, up - far, 0.0),
         np.where(reaches, samples.time_s[up] - samples.time_s[far], 0.0),
+        waits[up] > waits[far],
     )
 
 
@@ -232,7 +248,7 @@ def _count(
             junction.number,
             gates.arms[i].name,
             gates.arms[j].name,
-            _turn(gates, passes, rows),
+            _turn(gates.arms[i], gates.arms[j]),
             int(seen[i, j]),
             float(inferred[i, j]),
             share,
@@ -283,9 +299,11 @@ def _travel_and_delay(
     free = known.select(~known.stood)
     if travel is None or travel.n < _MIN_DELAYED or len(free.track) < _MIN_FREE:
         return travel, None
-    paced = free.farther_m >= _PACED_M
-    pace = float(np.quantile(free.farther_s[paced] / free.farther_m[paced], 0.1)) if paced.any() else np.inf
-    longer = np.maximum(known.farther_s - pace * known.farther_m, 0.0) if paced.any() else np.zeros(len(known.track))
+    goes = (known.farther_m >= _PACED_M) & ~known.farther_stood
+    longer = np.zeros(len(known.track))
+    if goes.sum() >= _MIN_FREE:
+        pace = float(np.quantile(known.farther_s[goes] / known.farther_m[goes], 0.1))
+        longer = np.maximum(known.farther_s - pace * known.farther_m, 0.0)
     whole = _mean_time(known.travel_s + longer, known, observed_s, spread)
     least = float(np.quantile(free.travel_s, 0.1))
     assert whole is not None
@@ -304,13 +322,11 @@ def _mean_time(
     return estimate_mean(mean + weight * (time_s - mean), passes.upstream_s, spread=spread)
 
 
-def _turn(gates: Gates, passes: Passes, rows: FloatArray) -> Turn:
-    """The turn that most vehicles of a movement make, by the directions of its gates."""
-    direction = np.array([gate.direction_rad for gate in gates.gates])
-    change = direction[passes.gate_out[rows]] - direction[passes.gate_in[rows]]
-    angle = float(np.angle(np.exp(1j * change).mean()))
-    if abs(angle) > np.radians(150):
+def _turn(arm_in: Arm, arm_out: Arm) -> Turn:
+    """The turn from one arm to another."""
+    if arm_in.number == arm_out.number:
         return "u-turn"
+    angle = float(np.angle(-np.exp(1j * (arm_out.outward_rad - arm_in.outward_rad))))
     if abs(angle) < np.radians(40):
         return "straight"
     return "right" if angle > 0 else "left"

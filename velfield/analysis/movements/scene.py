@@ -202,7 +202,7 @@ def find_scene_gates(
     )
     rank = {k: i for i, k in enumerate(order)}
     gates = tuple(Gate(*end, arm=rank[int(of)]) for end, of in zip(used, label, strict=True))
-    return gates, tuple(Arm(i, names[k], middle[k]) for i, k in enumerate(order))
+    return gates, tuple(Arm(i, names[k], middle[k], outward[k]) for i, k in enumerate(order))
 
 
 End = tuple[int, bool, FloatArray, float]
@@ -234,7 +234,9 @@ def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, gra
     if ends.sum() < _MIN_WHOLE or ends.sum() < _MIN_FRACTION * known.sum():
         return False
     slow = float(np.median(samples.speed_m_per_s[rows[ends]])) < _YARD_M_PER_S
-    return slow or _from_border_m(xy, graph) <= _INSIDE_M
+    # of a side street that ends at the picture's edge between longer ones the hull of the lanes says nothing
+    at_edge = float(min((xy - samples.xy_m.min(axis=0)).min(), (samples.xy_m.max(axis=0) - xy).min())) <= _INSIDE_M
+    return slow or at_edge or _from_border_m(xy, graph) <= _INSIDE_M
 
 
 def _terminal(samples: PathSamples, n: int, *, first: bool) -> IntArray:

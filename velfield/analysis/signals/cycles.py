@@ -9,7 +9,7 @@ from scipy import special
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
 from velfield.analysis.signals.phases import fit_phases
-from velfield.analysis.signals.queues import Stream
+from velfield.analysis.signals.queues import REACH_M, Stream
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
 MIN_CYCLE_S, MAX_CYCLE_S = 24.0, 200.0
@@ -19,7 +19,7 @@ _JUNCTION_STARTS = 4
 """Fewest starts of queues of a junction, of at least two streams or of one that alone has so many."""
 _NO_CYCLE_STARTS, _NO_CYCLE_S = 16, 300.0
 """With so many starts in so long a fixed cycle would show. At a roundabout, where vehicles give way and signals are
-rare, fewer show no cycle: some recur by chance."""
+rare, a cycle needs as many: fewer may recur by chance."""
 _FEW_STOP, _FEW_STOP_N, _FEW_STOP_S = 0.08, 60, 150.0
 """At a junction without a signal fewer stop than this share, with 95 % probability; all of a shorter clip may have come
 at green."""
@@ -369,15 +369,28 @@ def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
     late = float(special.ndtri((1 + LEVEL) / 2)) * stream.stop_time_sd_s
     share = stream.hidden_share
     behind = int(np.log((1 - LEVEL) / 2) / np.log(share)) if share > 0 else 0
+    cut = stream.approach.border_m >= REACH_M - 1.0  # at so far before the line, where vehicles are seen
+    edge_m = _SPACING_M if cut else min(_EDGE_M, stream.stop_line_m / 2)
     out = []
     for time in times_s:
         least, found = (_stand_at(stream, float(time), margin) for margin in (-late, 0.0))
         most = _stand_at(stream, float(time), late, through_gaps=True)
         value = found.seen + found.hidden
         vehicles = Estimate(value, min(least.seen, value), max(most.seen + most.room, value) + behind, found.seen)
-        reaches_edge = found.seen > 0 and stream.stop_line_m - found.length_m < _EDGE_M
+        reaches_edge = found.seen > 0 and stream.stop_line_m - found.length_m < edge_m
         out.append(Queue(float(time), vehicles, found.length_m, reaches_edge))
     return out
+
+
+def ends_out_of_view(stream: StreamSignal) -> bool:
+    """Whether a queue of a stream ends out of view at a green: how long it is is not known."""
+    return any(queue.reaches_edge for queue in queues(stream.stream, stream.green_s))
+
+
+def green_duration_s(streams: Sequence[StreamSignal], cycle_s: float) -> float | None:
+    """How long vehicles of the streams of a phase cross, yellow included, s; None where no onset of red is known."""
+    lasts = [(s.red_phase_s.value - s.green_phase_s.value) % cycle_s for s in streams if s.red_phase_s]
+    return max(lasts, default=None)
 
 
 @dataclass(frozen=True)

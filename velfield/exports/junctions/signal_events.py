@@ -16,7 +16,7 @@ import pandas as pd
 
 from schemas.arrays import FloatArray
 from schemas.export import ExportOptions
-from velfield.analysis.signals.cycles import JunctionSignal, StreamSignal
+from velfield.analysis.signals.cycles import JunctionSignal, StreamSignal, green_duration_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.run.run import Run
@@ -78,9 +78,10 @@ def _streams(signal: JunctionSignal) -> Iterator[tuple[int, StreamSignal]]:
 
 def _events(device: int, signal: JunctionSignal, analysis: TrafficAnalysis) -> Iterator[tuple[float, int, int, int]]:
     """Events of a junction: time, device, event and parameter."""
+    cycle_s = signal.cycle_s.value if signal.cycle_s else np.nan
     for phase in range(1, len(signal.phases) + 1):
         streams = [stream for number, stream in _streams(signal) if number == phase]
-        green, lasts = streams[0].green_s, green_duration_s(streams, signal)
+        green, lasts = streams[0].green_s, green_duration_s(streams, cycle_s)
         for kind, times in ((GREEN, green), (RED_CLEARANCE, green + lasts if lasts is not None else green[:0])):
             yield from ((t, device, kind, phase) for t in _seen(times, analysis))
     for _, stream in _streams(signal):
@@ -88,12 +89,6 @@ def _events(device: int, signal: JunctionSignal, analysis: TrafficAnalysis) -> I
         half_s = analysis.trajectories.length_m[s.cross_track] / 2 / np.maximum(s.cross_speed_m_per_s, _LEAST_M_PER_S)
         for kind, times in ((DETECTOR_ON, s.cross_time_s - half_s), (DETECTOR_OFF, s.cross_time_s + half_s)):
             yield from ((t, device, kind, channel) for t in times.tolist())
-
-
-def green_duration_s(streams: list[StreamSignal], signal: JunctionSignal) -> float | None:
-    """Time from the onset of a phase's green to the last onset of red of its streams, s; None: no stream's is known."""
-    cycle = signal.cycle_s.value if signal.cycle_s else np.nan
-    return max(((s.red_phase_s.value - s.green_phase_s.value) % cycle for s in streams if s.red_phase_s), default=None)
 
 
 def _seen(times_s: FloatArray, analysis: TrafficAnalysis) -> list[float]:

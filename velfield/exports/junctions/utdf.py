@@ -13,12 +13,11 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.export import ExportOptions
 from velfield.analysis.movements.movements import JunctionMovements, Movement
-from velfield.analysis.signals.cycles import JunctionSignal
+from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import HEAVY
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
-from velfield.exports.junctions.signal_events import green_duration_s
 from velfield.run.run import Run
 
 FILE_NAME = "synchro.csv"
@@ -178,7 +177,7 @@ class _Node:
         green: list[float | None] = [None] * _PHASES
         for k, lanes in enumerate(self.signal.phases[:_PHASES]):
             streams = [s for s in self.signal.streams if s.stream.approach.lane in lanes]
-            onset, lasts = streams[0].green_phase_s.value, green_duration_s(streams, self.signal)
+            onset, lasts = streams[0].green_phase_s.value, green_duration_s(streams, cycle)
             start[k] = round(onset % cycle, 1)
             if lasts is not None:
                 green[k], end[k] = round(lasts, 1), round((onset + lasts) % cycle, 1)

@@ -44,8 +44,8 @@ def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list
         weight = np.array([n for _, n in known]) / sum(n for _, n in known)
         value, low, high = (np.array([getattr(one, end) for one, _ in known]) for end in ("value", "low", "high"))
         mean = float(weight @ value)
-        below, above = (float(np.hypot.reduce(weight * (end - value))) for end in (low, high))
-        delay = Estimate(mean, mean - below, mean + above, sum(one.n for one, _ in known))
+        # movements of an arm wait in the same queues: their errors do not cancel
+        delay = Estimate(mean, float(weight @ low), float(weight @ high), sum(one.n for one, _ in known))
         partly = analysis.delay_is_partial(number, arm)
         out.append(ApproachDelay(arm, delay, delay_level(delay, signalised=signalised, partly=partly), limits, partly))
     return sorted(out, key=lambda one: -one.delay_s.value)

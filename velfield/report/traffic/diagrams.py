@@ -76,7 +76,7 @@ def traffic_diagrams(
             f"turning-{found.junction.number}",
             f"Junction {found.junction.number}: where vehicles go",
             "Arrows are as wide as the flow. Vehicles counted, and their share of those that enter by the arm; rare "
-            f"ways: fewer than {MIN_PASSES} went. "
+            f"ways: fewer than {MIN_PASSES} were seen to go. "
             "Arms are named by the side of the image that they lead to (N: its top).",
             partial(draw_turning, found=found),
             4.6,
@@ -88,7 +88,7 @@ def traffic_diagrams(
                 f"delay-{found.junction.number}",
                 f"Junction {found.junction.number}: delay and level of service by approach",
                 "Mean delay against vehicles that pass freely, in view, up to 150 m before the junction, of those that "
-                "were seen for 60 m; black lines: its 90 % interval. Or worse: queues end out of view. "
+                "were seen for 60 m; black lines: its 90 % interval. Or worse: the queue ends out of view. "
                 "Level of service by the Highway Capacity Manual, 7th edition (A: best, F: "
                 "worst); dashed: where the next level begins.",
                 partial(draw_delays, delays=delays),
@@ -129,7 +129,7 @@ def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Ite
         f"queue-{number}",
         f"Junction {number}: queues against time",
         "Vehicles that stand from the stop line on, to the first gap: none some seconds after green, when those at the "
-        "line have gone.",
+        "line have gone. Where a queue ends out of view it is a lower bound.",
         partial(draw_queues, analysis=analysis, streams=streams, names=names),
     )
 
@@ -255,7 +255,7 @@ def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
         counted = sum(m.seen + m.inferred for m in mine)
         total = max([counted, *((m.seen + m.inferred) / m.share.value for m in mine if m.share)])
         lines += [f"by rare ways: {total - counted:.0f}"] if total - counted >= 0.5 else []
-        lines = [f"from {name}: {total:.0f}", *lines] if mine else [f"{name}: hardly any from there"]
+        lines = [f"from {name}: {total:.0f}", *lines] if mine else [f"{name}: no turns known from there"]
         side = "left" if outward[0] > 0.3 else "right" if outward[0] < -0.3 else "center"
         up = "top" if outward[1] > 0.7 else "bottom" if outward[1] < -0.7 else "center"
         axes.text(

@@ -6,12 +6,11 @@ from schemas.export import SpeedUnit
 from velfield.analysis.answers import (
     DELAY_OF_PART,
     duration_text,
-    ends_out_of_view,
     find_answers,
     lanes_text,
     queue_text,
 )
-from velfield.analysis.signals.cycles import queues
+from velfield.analysis.signals.cycles import ends_out_of_view, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.traffic.approaches import approach_delays, lane_names
 
@@ -89,9 +88,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
 
 
 def _more(lines: list[str]) -> tuple[str, ...]:
-    return (
-        (f"and {len(lines) - _PER_QUESTION} more, in the tables of report.html",) if len(lines) > _PER_QUESTION else ()
-    )
+    return (f"and {len(lines) - _PER_QUESTION} more, in the tables",) if len(lines) > _PER_QUESTION else ()
 
 
 def _waits(analysis: TrafficAnalysis) -> list[str]:
@@ -114,14 +111,16 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
         said = [f"mean delay{part} " + ", ".join(parts)] if parts else []
         silent = {m.arm_in for m in found.movements} - {d.arm for d in delays}
         said += (
-            [f"delay from {', '.join(sorted(silent))} not known: few were seen for 60 m"] if parts and silent else []
+            [f"delay from {', '.join(sorted(silent))} not known: 10 must be seen for 60 m, 3 of them without a stop"]
+            if parts and silent
+            else []
         )
         if longest and longest[0].vehicles.value:
             lane = longest[1].stream.approach.lane
             said.append(f"longest queue at green in view {names.get(lane, f'lane {lane}')}: {queue_text(longest[0])}")
             beyond = [s.stream.approach.lane for s in signal.streams if ends_out_of_view(s)] if signal else []
             others = [other for other in beyond if other != lane]
-            said += [f"out of view end those of {lanes_text(others)} too"] if others else []
+            said += [f"those of {lanes_text(others)} end out of view too"] if others else []
         if said:
             out.append(f"junction {number}: " + "; ".join(said))
     return out
