@@ -24,8 +24,10 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
     answers = {question: " ".join(lines) for question, lines in page.answers}
     assert len(answers) == 5
     assert "cycle 40.0 s" in answers["Is there a signal?"]
-    assert re.search(r"from W \(lane \d+\): green for \d+ s .*, 60 vehicles crossed", answers["Is there a signal?"])
-    assert re.search(r"longest queue at green in view from W, lane \d: 4 vehicles", " ".join(answers.values()))
+    assert re.search(
+        r"from W \(lane \d+\): green and yellow for \d+ s .*, 60 vehicles crossed", answers["Is there a signal?"]
+    )
+    assert re.search(r"junction \d from W: .*; longest queue when green begins 4 vehicles", " ".join(answers.values()))
     assert any(line.startswith("classes") for line in page.withheld)
     assert page.sections[-1][0].startswith("What is not known")
 

@@ -9,7 +9,8 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.intervals import Estimate, estimate_event_rate
-from velfield.analysis.signals.cycles import JunctionSignal, Queue, ends_out_of_view, green_duration_s, queues
+from velfield.analysis.movements.movements import JunctionMovements
+from velfield.analysis.signals.cycles import JunctionSignal, Queue, green_duration_s, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 
@@ -70,6 +71,12 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
             yield Answer("signal", f"crossing {number}", "too little data", TWO_LEVELS)
         else:
             yield _signal(analysis, signal)
+    for found in analysis.movements:
+        for arm, queue in longest_queues(analysis, found).items():
+            text = f"longest when green begins {queue_text(queue)}"
+            yield Answer(
+                "queue", f"junction {found.junction.number} from {arm}", "found", text, queue.vehicles, "vehicles"
+            )
     seconds = analysis.trajectories.duration_s
     yield _events(
         "u-turns", len(analysis.reversals), seconds, _places([_near(analysis, r.xy_m) for r in analysis.reversals])
@@ -174,7 +181,6 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     text = f"cycle {estimate_text(signal.cycle_s, 's')}, {count_text(len(signal.phases), 'phase')}"
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
-        longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
         lasts = green_duration_s(streams, signal.cycle_s.value)
         long = f" and yellow for {lasts:.0f} s" if lasts else ""
         begins = estimate_text(streams[0].green_phase_s, "s")
@@ -183,12 +189,20 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
             f"; {_from_arms(analysis, signal.junction, lanes)}green{long} from {begins} into the cycle, "
             f"{count_text(len(crossed), 'vehicle')} crossed"
         )
-        if longest:
-            text += f", longest queue in view at green {queue_text(longest)}"
-        beyond = [s.stream.approach.lane for s in streams if ends_out_of_view(s)]
-        if beyond and longest and not longest.reaches_edge:
-            text += f" (those of {lanes_text(beyond)} end out of view)"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
+
+
+def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, Queue]:
+    """The longest queue at a green of each arm of a junction whose signal is known, where vehicles queue."""
+    signal, gates = analysis.signals.get(found.junction.number), found.gates
+    arm = {gate.lane: gates.arms[gate.arm].name for gate in gates.gates if gate.inwards}
+    out: dict[str, Queue] = {}
+    for stream in signal.streams if signal else ():
+        name = arm.get(stream.stream.approach.lane)
+        for queue in queues(stream.stream, stream.green_s):
+            if name and queue.vehicles.value and (name not in out or queue.length_m > out[name].length_m):
+                out[name] = queue
+    return out
 
 
 def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -> str:
@@ -249,7 +263,7 @@ def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
             if rate
             else ", too short to say how often"
         )
-        text = f"{n}{often}: {detail}" if detail else f"{n}{often}"
+        text = f"{n} seen{often}: {detail}" if detail else f"{n} seen{often}"
         return Answer(topic, "", "found", text, rate, "/h" if rate else "")
     if seconds < _SHORT_S:
         text = f"none was seen in {duration_text(seconds)}, too short a time to say how rare they are"

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from velfield.analysis.answers import DELAY_OF_PART
 from velfield.analysis.flow.volume import LOS_SIGNAL_S, LOS_YIELD_S, delay_level
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.movements.movements import JunctionMovements
@@ -27,8 +28,9 @@ class ApproachDelay:
     @property
     def text(self) -> str:
         """The delay and its level, for people."""
-        level = f" (level of service {self.level})" if self.level else ""
-        return f"{self.delay_s.value:.0f} s{level}"
+        delay, level = self.delay_s, f", level of service {self.level}" if self.level else ""
+        part = DELAY_OF_PART if self.partly else ""
+        return f"{delay.value:.0f} s ({delay.low:.0f} to {delay.high:.0f}, n {delay.n}){part}{level}"
 
 
 def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list[ApproachDelay]:

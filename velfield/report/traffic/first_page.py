@@ -3,18 +3,13 @@
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import (
-    DELAY_OF_PART,
-    duration_text,
-    find_answers,
-    lanes_text,
-    queue_text,
-)
-from velfield.analysis.signals.cycles import ends_out_of_view, queues
+from velfield.analysis.answers import count_text, duration_text, find_answers, longest_queues, queue_text
+from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.report.traffic.approaches import approach_delays, lane_names
+from velfield.report.traffic.approaches import approach_delays
 
-_PER_QUESTION = 3
+_PER_QUESTION = 4
+_NO_DELAY = "delay not known: 10 must be seen for 60 m, 3 of them without a stop"
 _EVENTS = {
     "conflicts": "conflicts",
     "u-turns": "U-turns",
@@ -92,35 +87,26 @@ def _more(lines: list[str]) -> tuple[str, ...]:
 
 
 def _waits(analysis: TrafficAnalysis) -> list[str]:
-    """A line on each junction with a known delay or queue, those with most vehicles first."""
+    """A line on each approach with a known delay or queue: of the junctions with most vehicles first, and of these the
+    approach that waits longest."""
+    return [
+        line
+        for found in sorted(analysis.movements, key=lambda m: -m.volume)
+        if analysis.ways_meet(found.junction.number)
+        for line in _approaches(analysis, found)
+    ]
+
+
+def _approaches(analysis: TrafficAnalysis, found: JunctionMovements) -> list[str]:
+    """A line on each approach of a junction with a known delay or queue."""
+    longest = longest_queues(analysis, found)
+    delays = {delay.arm: delay for delay in approach_delays(analysis, found)}
     out = []
-    for found in sorted(analysis.movements, key=lambda m: -m.volume):
-        number = found.junction.number
-        signal = analysis.signals.get(number)
-        if not analysis.ways_meet(number):
-            continue
-        delays = approach_delays(analysis, found)
-        parts = [f"from {d.arm} {d.text}" for d in delays]
-        names = lane_names(found)
-        longest = max(
-            ((q, s) for s in (signal.streams if signal else ()) for q in queues(s.stream, s.green_s)),
-            key=lambda pair: pair[0].length_m,
-            default=None,
-        )
-        part = DELAY_OF_PART if any(d.partly for d in delays) else ""
-        said = [f"mean delay{part} " + ", ".join(parts)] if parts else []
-        silent = {m.arm_in for m in found.movements} - {d.arm for d in delays}
-        said += (
-            [f"delay from {', '.join(sorted(silent))} not known: 10 must be seen for 60 m, 3 of them without a stop"]
-            if parts and silent
-            else []
-        )
-        if longest and longest[0].vehicles.value:
-            lane = longest[1].stream.approach.lane
-            said.append(f"longest queue at green in view {names.get(lane, f'lane {lane}')}: {queue_text(longest[0])}")
-            beyond = [s.stream.approach.lane for s in signal.streams if ends_out_of_view(s)] if signal else []
-            others = [other for other in beyond if other != lane]
-            said += [f"those of {lanes_text(others)} end out of view too"] if others else []
-        if said:
-            out.append(f"junction {number}: " + "; ".join(said))
+    for name in (*delays, *(name for name in longest if name not in delays)):
+        entered = sum(m.seen + m.inferred for m in found.movements if m.arm_in == name)
+        said = [count_text(round(entered), "vehicle")]
+        said.append(f"mean delay {delays[name].text}" if name in delays else _NO_DELAY)
+        if name in longest:
+            said.append(f"longest queue when green begins {queue_text(longest[name])}")
+        out.append(f"junction {found.junction.number} from {name}: " + "; ".join(said))
     return out
