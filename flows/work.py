@@ -41,6 +41,8 @@ class UnderWay:
     stage: Stage
     plan: Plan
     units: list[Unit]
+    records: list[CommitRecord | None]
+    """What an earlier run wrote of each, without its outputs; None: it is to be computed."""
     essential: bool
     progress: StageProgress
     show: Callable[[int], None]
@@ -160,10 +162,12 @@ class Work:
         units = stage_units(self.plan, stage)
         total = sum(unit.steps for unit in units)
         progress.expect(total)
-        progress.at_least(sum(u.steps for u in units if committed(self.plan, stage.name, u.name) is not None))
+        found = (committed(self.plan, stage.name, unit.name) for unit in units)
+        records = [None if record is None else _without_outputs(record) for record in found]
+        progress.at_least(sum(unit.steps for unit, record in zip(units, records, strict=True) if record))
         whole = stage.essential if essential is None else essential
         show = self.orchestration.show_progress(stage.name, total)
-        under_way = UnderWay(stage, self.plan, units, whole, progress, show, time.monotonic())
+        under_way = UnderWay(stage, self.plan, units, records, whole, progress, show, time.monotonic())
         self._stages[stage.name] = under_way
         for k, unit in enumerate(units):
             if gone := [name for name in self._alike(stage) if unit.name in self._stages[name].lost]:
@@ -196,8 +200,8 @@ class Work:
 
     def _submit(self, under_way: UnderWay, k: int, graph: GraphOf) -> None:
         plan, stage, unit = under_way.plan, under_way.stage, under_way.units[k]
-        record = committed(plan, stage.name, unit.name)
-        under_way.before += [] if record is None else [_without_outputs(record)]
+        record = under_way.records[k]
+        under_way.before += [] if record is None else [record]
 
         failed = ""
 
@@ -206,7 +210,7 @@ class Work:
             if failed:
                 self.console.warn(f"{self._describe(under_way, unit)} failed: {failed}; trying again")
             try:
-                return _without_outputs(record or self.runner.compute(graph(plan, stage, unit)))
+                return record or _without_outputs(self.runner.compute(graph(plan, stage, unit)))
             except Exception as error:
                 failed = _reason(error)
                 raise

@@ -194,8 +194,7 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
 
 def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, Queue]:
     """The longest queue at a green of each arm of a junction whose signal is known, where vehicles queue."""
-    signal, gates = analysis.signals.get(found.junction.number), found.gates
-    arm = {gate.lane: gates.arms[gate.arm].name for gate in gates.gates if gate.inwards}
+    signal, arm = analysis.signals.get(found.junction.number), found.gates.arms_in
     out: dict[str, Queue] = {}
     for stream in signal.streams if signal else ():
         name = arm.get(stream.stream.approach.lane)
@@ -207,8 +206,8 @@ def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[
 
 def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -> str:
     """Where the lanes of a phase come from."""
-    gates = next(found.gates for found in analysis.movements if found.junction.number == junction)
-    arms = sorted({gates.arms[gate.arm].name for gate in gates.gates if gate.inwards and gate.lane in lanes})
+    arms_in = next(found.gates for found in analysis.movements if found.junction.number == junction).arms_in
+    arms = sorted({arm for lane, arm in arms_in.items() if lane in lanes})
     return f"from {' and '.join(arms)} ({lanes_text(lanes)}): " if arms else f"{lanes_text(lanes)}: "
 
 

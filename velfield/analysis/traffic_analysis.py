@@ -190,8 +190,7 @@ class TrafficAnalysis:
         """Junctions and arms whose queues end out of view at a green, of signals whose cycle is known."""
         out = set()
         for found in self.movements:
-            arm = {gate.lane: found.gates.arms[gate.arm].name for gate in found.gates.gates if gate.inwards}
-            signal = self.signals.get(found.junction.number)
+            signal, arm = self.signals.get(found.junction.number), found.gates.arms_in
             for one in signal.streams if signal else ():
                 if ends_out_of_view(one):
                     out.add((found.junction.number, arm.get(one.stream.approach.lane, "")))

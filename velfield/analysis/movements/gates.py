@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,6 +20,10 @@ _ARM_RAD = np.radians(35)
 """Axes of one arm's gates differ by less."""
 _COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
 """Sides of the image by direction, every 45° from the right, clockwise."""
+
+
+End: TypeAlias = tuple[int, bool, FloatArray, float]
+"""A lane, whether it leads inwards, its position, m, and its direction, rad."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,11 @@ class Gates:
     gates: tuple[Gate, ...]
     arms: tuple[Arm, ...]
 
+    @property
+    def arms_in(self) -> dict[int, str]:
+        """Names of the arms by which the lanes lead in, by lane."""
+        return {gate.lane: self.arms[gate.arm].name for gate in self.gates if gate.inwards}
+
     def nearest(self, xy_m: FloatArray, direction_rad: FloatArray, *, inwards: bool) -> IntArray:
         """Number of the gate (n,) nearest to each crossing of its direction, -1: none near.
 
@@ -71,8 +81,8 @@ class Gates:
 
 def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
     """Gates and arms of a junction."""
-    found: list[tuple[int, bool, FloatArray, float]] = []
-    roads: list[tuple[int, bool, FloatArray, float]] = []
+    found: list[End] = []
+    roads: list[End] = []
     for lane in graph:
         inside = inside_hull(lane.xy_m, junction.hull_m)
         for k in np.flatnonzero(inside[:-1] != inside[1:]):
@@ -101,19 +111,18 @@ def _middle(xy_m: FloatArray, k: int) -> tuple[FloatArray, float]:
     return (xy_m[k] + xy_m[k + 1]) / 2, float(np.arctan2(step[1], step[0]))
 
 
-def _outward(gates: list[tuple[int, bool, FloatArray, float]]) -> float:
+def _outward(gates: list[End]) -> float:
     """Mean direction away from the junction, rad: along lanes out, against lanes in."""
     return float(np.angle(sum(np.exp(1j * (direction + np.pi * inwards)) for _, inwards, _, direction in gates)))
 
 
-def group_gates(*places: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
+def group_gates(*places: list[End]) -> IntArray:
     """Number of each gate's arm: gates near each other, of one axis, are of one arm.
 
     Parameters
     ----------
     places
-        For each gate: its lane, whether it leads inwards, its position, m, and its direction, rad. Of several such
-        lists gates are of one arm that are near each other in one of them.
+        Of each gate. Of several such lists gates are of one arm that are near each other in one of them.
     """
     n = len(places[0])
     label = np.arange(n)
@@ -124,7 +133,7 @@ def group_gates(*places: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
     return label
 
 
-def _of_one_road(a: tuple[int, bool, FloatArray, float], b: tuple[int, bool, FloatArray, float]) -> bool:
+def _of_one_road(a: End, b: End) -> bool:
     turn = abs(float(np.angle(np.exp(1j * (a[3] + np.pi * a[1] - b[3] - np.pi * b[1])))))
     return bool(np.hypot(*(a[2] - b[2])) < _ARM_M and turn < _ARM_RAD)
 

@@ -40,6 +40,8 @@ _SPREAD_N = 8
 """The standard deviation of all travel times through a junction counts for so many of a movement's vehicles: five may
 all have come at green."""
 
+_NOWHERE = np.empty(0, np.int64)
+
 
 @dataclass(frozen=True)
 class Passes:
@@ -141,12 +143,17 @@ def find_movements(
     cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
     samples = cut.samples
     slices = ObservedSlices.of(trajectories.observed_s, _SLICE_S)
-    ways_meet = [junction for junction in graph.junctions if junction.kind in ("intersection", "roundabout")]
-    waits_elsewhere = np.unique(np.concatenate([np.empty(0, np.int64), *(_inside(samples, j) for j in ways_meet)]))
+    inside = [_inside(samples, junction) for junction in graph.junctions]
+    meet = [
+        rows
+        for junction, rows in zip(graph.junctions, inside, strict=True)
+        if junction.kind in ("intersection", "roundabout")
+    ]
+    waits_elsewhere = np.unique(np.concatenate([_NOWHERE, *meet]))
     out = []
-    for junction in graph.junctions:
+    for junction, rows in zip(graph.junctions, inside, strict=True):
         gates = find_gates(graph, junction)
-        passes = find_passes(samples, junction, gates, waits_elsewhere)
+        passes = _passes(samples, rows, gates, waits_elsewhere)
         passes = _within(_by_track(passes, cut), *trajectories.window_s)
         movements = tuple(_count(junction, gates, passes, slices, trajectories.observed_s))
         out.append(JunctionMovements(junction, gates, passes, movements))
@@ -159,12 +166,14 @@ def _inside(samples: PathSamples, junction: Junction) -> IntArray:
     return near[inside_hull(samples.xy_m[near], junction.hull_m)]
 
 
-def find_passes(
-    samples: PathSamples, junction: Junction, gates: Gates, waits_elsewhere: IntArray | None = None
-) -> Passes:
-    """Tracks in the area of a junction; ``waits_elsewhere``: rows of the samples, in order, in areas where vehicles
-    wait for each other: delays begin behind the last one."""
-    inside = _inside(samples, junction)
+def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passes:
+    """Tracks in the area of a junction."""
+    return _passes(samples, _inside(samples, junction), gates, _NOWHERE)
+
+
+def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits_elsewhere: IntArray) -> Passes:
+    """Tracks in the area of a junction, which rows ``inside`` of the samples are in; ``waits_elsewhere``: rows, in
+    order, in areas where vehicles wait for each other: delays begin behind the last one."""
     if not len(inside):
         none, number = np.empty(0), np.empty(0, np.int64)
         no = np.empty(0, bool)
@@ -179,7 +188,7 @@ def find_passes(
     up = np.maximum(first - _UPSTREAM_M, 0)
     reaches = enters & (samples.track[up] == samples.track[first])
     far = np.maximum(up - _FARTHER_M, np.searchsorted(samples.track, samples.track[first]))
-    if waits_elsewhere is not None and len(waits_elsewhere):
+    if len(waits_elsewhere):
         before = np.searchsorted(waits_elsewhere, up, side="right") - 1
         far = np.maximum(far, np.where(before >= 0, waits_elsewhere[before], -1) + 1)
     far = np.where(reaches, np.minimum(far, up), up)

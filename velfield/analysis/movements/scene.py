@@ -19,7 +19,7 @@ from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, 
 from velfield.analysis.lanes.junctions import buffered_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks
-from velfield.analysis.movements.gates import Arm, Gate, group_gates, name_arms
+from velfield.analysis.movements.gates import Arm, End, Gate, group_gates, name_arms
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
@@ -203,9 +203,6 @@ def find_scene_gates(
     rank = {k: i for i, k in enumerate(order)}
     gates = tuple(Gate(*end, arm=rank[int(of)]) for end, of in zip(used, label, strict=True))
     return gates, tuple(Arm(i, names[k], middle[k], outward[k]) for i, k in enumerate(order))
-
-
-End = tuple[int, bool, FloatArray, float]
 
 
 def _faces(a: End, b: End) -> bool:

@@ -55,5 +55,4 @@ def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list
 
 def lane_names(found: JunctionMovements) -> dict[int, str]:
     """``from W, lane 3`` of each lane that leads into a junction."""
-    gates = found.gates
-    return {g.lane: f"from {gates.arms[g.arm].name}, lane {g.lane}" for g in gates.gates if g.inwards}
+    return {lane: f"from {arm}, lane {lane}" for lane, arm in found.gates.arms_in.items()}

@@ -337,6 +337,12 @@ def draw_time_space(axes: "Axes", *, analysis: TrafficAnalysis, stream: StreamSi
     axes.set(xlim=(begin, end), ylim=(max(low, -120), 40), xlabel="time, s", ylabel="distance past the stop line, m")
 
 
+def _legend_above(axes: "Axes", columns: int, *, spacing: float = 2.0) -> None:
+    axes.legend(
+        ncols=columns, frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0, 1.0), columnspacing=spacing
+    )
+
+
 def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[StreamSignal], names: dict[int, str]) -> None:
     """Vehicles that stand, by approach, against time."""
     begin, end = _window(analysis)
@@ -347,7 +353,7 @@ def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[Stream
         axes.step(times, counts, where="post", color=_TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
                   label=names.get(lane, f"lane {lane}"))  # fmt: skip
     axes.set(xlabel="time, s", ylabel="standing vehicles", ylim=(0, None), xlim=(begin, end))
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=4, frameon=False, fontsize=9)
+    _legend_above(axes, 4)
 
 
 def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, unit: SpeedUnit) -> None:
@@ -361,7 +367,7 @@ def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, un
         if known:
             axes.plot(*np.array(known).T, color="#1b1f24", linestyle=stroke, label=label)
     axes.set(xlabel="along the lane, m", ylabel=f"speed, {unit}", ylim=(0, None))
-    axes.legend(ncols=4, frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0, 1.0))
+    _legend_above(axes, 4)
 
 
 def fundamental_points(analysis: TrafficAnalysis) -> FloatArray:
@@ -389,7 +395,7 @@ def draw_fundamental(axes: "Axes", *, points: FloatArray, per_m_per_s: float, un
     middle = (0.55 * edge, 0.55 * edge * speed * 3.6)
     axes.annotate(f"{speed * per_m_per_s:.0f} {unit} ", middle, fontsize=9, ha="right", va="bottom")
     axes.set(xlabel="density, vehicles a km", ylabel="flow, vehicles an hour", xlim=(0, right * 1.05), ylim=(0, top))
-    axes.legend(frameon=False, fontsize=9, ncols=6, loc="lower left", bbox_to_anchor=(0, 1.0), columnspacing=1)
+    _legend_above(axes, 6, spacing=1.0)
 
 
 def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovements) -> None:
@@ -407,7 +413,7 @@ def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovemen
             axes.step(edges / 60, minutes, where="post", color=_TONES[k % 6], linestyle=_STROKES[k % 4],
                       linewidth=1.6, label=f"from {one.name}")  # fmt: skip
     axes.set(xlabel="time, min", ylabel="vehicles a minute", ylim=(0, None))
-    axes.legend(frameon=False, fontsize=9, ncols=6, loc="lower left", bbox_to_anchor=(0, 1.0))
+    _legend_above(axes, 6)
 
 
 def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
