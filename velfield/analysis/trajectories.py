@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -137,8 +138,8 @@ class Trajectories:
             first,
             self.frame[rows],
             self.time_s[rows],
-            self.xy_m[rows],
-            self.velocity_m_per_s[rows],
+            np.compress(rows, self.xy_m, axis=0),  # a fifth of the time of an index by a mask
+            np.compress(rows, self.velocity_m_per_s, axis=0),
             self.gsd_m,
             None if self.measured_length_m is None else self.measured_length_m[keep],
             self.position_sd_m,
@@ -318,6 +319,13 @@ class PathSamples:
     def __len__(self) -> int:
         return len(self.track)
 
+    @cached_property
+    def bounds_m(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest x and y (2,) of all points."""
+        # by column: numpy reduces a long array of two columns along its rows many times as slowly
+        columns = self.xy_m[:, 0], self.xy_m[:, 1]
+        return np.array([c.min() for c in columns]), np.array([c.max() for c in columns])
+
 
 def within(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> IntArray:
     """Rows of the positions (n, 2) in a box with its corners at ``low_m`` and ``high_m`` (2,)."""
@@ -327,9 +335,9 @@ def within(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> IntArray:
 
 
 def group_rows(group: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Rows in the order of their group (rows,), and the borders (n + 1,) of the n groups among them."""
-    order = np.argsort(group, kind="stable")
-    return order, np.searchsorted(group[order], np.arange(n + 1))
+    """Rows in the order of their group (rows,), each from 0 below n, and the borders (n + 1,) of the n groups."""
+    small = group.astype(np.int16) if n < 1 << 15 else group  # numpy sorts these by their digits
+    return np.argsort(small, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(group, minlength=n))])
 
 
 def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamples:

@@ -121,10 +121,12 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
     samples, length = traffic.samples(lane), traffic.graph.lanes[lane].length_m
     slices = ObservedSlices.of(observed_s, slice_s)
     rows, step, wait = _steps(samples)
-    driven, spent = np.zeros(len(slices)), np.zeros(len(slices))
-    # a long wait between two samples spreads over slices
+    begin = samples.time_s[rows]
+    whole = slices.number(begin) == slices.number(begin + wait)
+    driven, spent = (slices.sums(begin[whole], weights[whole]) for weights in (step, wait))
+    begin, step, wait = begin[~whole], step[~whole], wait[~whole]  # these spread over slices
     for part in range(8):
-        at = samples.time_s[rows] + wait * (part + 0.5) / 8
+        at = begin + wait * (part + 0.5) / 8
         driven += slices.sums(at, step / 8)
         spent += slices.sums(at, wait / 8)
     area = length * np.maximum(slices.end_s - slices.begin_s, 1e-9)

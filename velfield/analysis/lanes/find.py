@@ -67,7 +67,9 @@ def _long_enough(samples: PathSamples) -> PathSamples:
     keep = count[samples.track] >= _MIN_LENGTH_M
     if keep.all():
         return samples
-    return PathSamples(*(getattr(samples, name)[keep] for name in PathSamples.__dataclass_fields__))
+    return PathSamples(
+        *(np.compress(keep, getattr(samples, name), axis=0) for name in PathSamples.__dataclass_fields__)
+    )
 
 
 def _no_samples() -> LaneSamples:

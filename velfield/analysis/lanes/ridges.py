@@ -53,7 +53,7 @@ class Nodes:
 
 def bin_keys(xy_m: FloatArray, direction_rad: FloatArray) -> IntArray:
     """One number (n,) for the bin of each sample; positions lie within 500 km of the origin."""
-    x, y = np.floor(xy_m.T / BIN_M).astype(np.int64) + (1 << 20)
+    x, y = (np.floor(xy_m[:, k] / BIN_M).astype(np.int64) + (1 << 20) for k in (0, 1))
     sector = np.rint(direction_rad / (2 * np.pi / SECTORS)).astype(np.int64) % SECTORS
     return np.asarray((y << 21 | x) * SECTORS + sector)
 

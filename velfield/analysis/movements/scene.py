@@ -232,7 +232,8 @@ def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, gra
         return False
     slow = float(np.median(samples.speed_m_per_s[rows[ends]])) < _YARD_M_PER_S
     # of a side street that ends at the picture's edge between longer ones the hull of the lanes says nothing
-    at_edge = float(min((xy - samples.xy_m.min(axis=0)).min(), (samples.xy_m.max(axis=0) - xy).min())) <= _INSIDE_M
+    low, high = samples.bounds_m
+    at_edge = float(min((xy - low).min(), (high - xy).min())) <= _INSIDE_M
     return slow or at_edge or _from_border_m(xy, graph) <= _INSIDE_M
 
 
