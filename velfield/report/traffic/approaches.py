@@ -1,8 +1,11 @@
 """Approaches of a junction for people: names of their lanes, delay, level of service."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import hypot, sqrt
 
 import numpy as np
+from scipy import stats
 
 from velfield.analysis.answers import DELAY_OF_PART
 from velfield.analysis.flow.volume import LOS_SIGNAL_S, LOS_YIELD_S, delay_level
@@ -51,6 +54,35 @@ def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list
         partly = analysis.delay_is_partial(number, arm)
         out.append(ApproachDelay(arm, delay, delay_level(delay, signalised=signalised, partly=partly), limits, partly))
     return sorted(out, key=lambda one: -one.delay_s.value)
+
+
+def compare_delays(delays: Sequence[ApproachDelay]) -> str:
+    """By how much the first approach, with the longest delay, waits longer than the last; or that none is shown to.
+
+    The two are chosen by their delays, so the interval is that of the range of all of them.
+
+    Examples
+    --------
+    >>> east = ApproachDelay("E", Estimate(46, 39, 53, 60), "", (), False)
+    >>> west = ApproachDelay("W", Estimate(22, 15, 29, 60), "", (), False)
+    >>> compare_delays([east, west])
+    'vehicles from E wait 24 s (14 to 34) longer than those from W'
+    >>> compare_delays([west, west])
+    'no approach is shown to wait longer than another: 0 s lie between the mean delays'
+    """
+    if len(delays) < 2:
+        return ""
+    longest, shortest = delays[0], delays[-1]
+    sd_s = [(d.delay_s.high - d.delay_s.low) / (2 * stats.norm.ppf(0.95)) for d in (longest, shortest)]
+    reach_s = float(stats.studentized_range.ppf(0.9, len(delays), np.inf)) * hypot(*sd_s) / sqrt(2)
+    by_s = longest.delay_s.value - shortest.delay_s.value
+    part = f",{DELAY_OF_PART}" if longest.partly or shortest.partly else ""
+    if by_s < reach_s:
+        return f"no approach is shown to wait longer than another{part}: {by_s:.0f} s lie between the mean delays"
+    return (
+        f"vehicles from {longest.arm} wait {by_s:.0f} s ({by_s - reach_s:.0f} to {by_s + reach_s:.0f}) longer than "
+        f"those from {shortest.arm}{part}"
+    )
 
 
 def lane_names(found: JunctionMovements) -> dict[int, str]:

@@ -6,7 +6,7 @@ from schemas.export import SpeedUnit
 from velfield.analysis.answers import count_text, duration_text, find_answers, longest_queues, queue_text
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.report.traffic.approaches import approach_delays
+from velfield.report.traffic.approaches import approach_delays, compare_delays
 
 _PER_QUESTION = 4
 _NO_DELAY = "delay not known: 10 must be seen for 60 m, 3 of them without a stop"
@@ -37,6 +37,10 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     found: dict[str, list[str]] = {}
     withheld: list[str] = []
     reasons: dict[str, list[str]] = {}
+    fairness = {
+        f"junction {found.junction.number}": compare_delays(approach_delays(analysis, found))
+        for found in analysis.movements
+    }
     for answer in find_answers(analysis, unit=unit):
         place = f"{answer.subject}: " if answer.subject else ""
         text = place + answer.text
@@ -45,6 +49,8 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             reasons.setdefault(answer.topic, []).append(place + answer.text.removeprefix("too little data: "))
         else:
             found.setdefault(answer.topic, []).append(text)
+            if answer.topic == "signal" and answer.estimate and fairness.get(answer.subject):
+                found["signal"].append(place + fairness[answer.subject])
 
     def why(topic: str, otherwise: str) -> str:
         return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
@@ -62,7 +68,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             _waits(analysis),
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
-        ("Is there a signal?", found.get("signal", []), why("signal", no_junction)),
+        ("Is there a signal, and is it fair?", found.get("signal", []), why("signal", no_junction)),
         (
             "How fast do vehicles drive?",
             found.get("speed", []) or found.get("mean speed", []),

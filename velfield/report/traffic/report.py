@@ -109,7 +109,7 @@ def _front(record: AnalysisRecord, page: FirstPage, place: Diagram) -> tuple[lis
         figure.text(0.08, y / _PAGE_IN[1], line, fontsize=10, parse_math=False)
         y -= 0.19
     y = _place(figure, place, y - 0.05) - 0.1
-    for question, lines in (*page.sections, ("", (BRACKETS,))):
+    for question, lines in (("Answers", (BRACKETS,)), *page.sections):
         for line, follows in ((question, lines[0]), *((line, "") for line in lines)):
             if y - _LINE_IN * (len(_wrapped(line)) + len(_wrapped(follows))) < _FOOT_IN:
                 pages.append(new_figure(*_PAGE_IN))
