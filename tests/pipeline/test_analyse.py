@@ -80,7 +80,7 @@ def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str
     analyse(tracks=folder.parent / "tracks.csv", out=folder.parent / "again")
     text = capsys.readouterr().out
     assert re.search(r"signal +junction \d: cycle 40.0 s \(\d", text)
-    assert re.search(r"junction \d, W to E: \d+ vehicles, [\d.]+ % \([\d.]+ to [\d.]+, n \d+\) of those from W", text)
+    assert re.search(r"junction \d, W to E: \d+ vehicles, \d+ % \(\d+ to \d+\) of \d+ from W", text)
     assert re.search(r"u-turns +none in \d.* min, so fewer than \d", text)
 
 

@@ -25,7 +25,7 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
     assert len(answers) == 5
     assert "cycle 40.0 s" in answers["Is there a signal, and is it fair?"]
     assert re.search(
-        r"from W \(lane \d+\): green and yellow for \d+ s .*, 60 vehicles crossed",
+        r"from W \(lane \d+\): green and yellow for \d+ s, .*, 60 vehicles crossed",
         answers["Is there a signal, and is it fair?"],
     )
     assert re.search(r"junction \d from W: .*; longest queue when green begins 4 vehicles", " ".join(answers.values()))

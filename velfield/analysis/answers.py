@@ -17,8 +17,9 @@ from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS = 60.0, 30
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
-DELAY_OF_PART = " in view"
-_AT_JUNCTION_M = 20.0
+DELAY_OF_PART = " or more"
+"""Said after a delay of vehicles that come into view when they wait already."""
+_AT_JUNCTION_M, _ROAD_M = 20.0, 50.0
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
 
@@ -139,7 +140,7 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
     # Where lanes merge there is no choice.
     found = [m for j in analysis.movements if kinds[j.junction.number] != "merge" for m in j.movements]
     for m in sorted(found, key=lambda m: (not analysis.ways_meet(m.junction), -(m.seen + m.inferred))):
-        share = f", {estimate_text(m.share, '%', 100)} of those from {m.arm_in}" if m.share else ""
+        share = _share_text(m.share, m.seen + m.inferred, m.arm_in)
         partly = DELAY_OF_PART if analysis.delay_is_partial(m.junction, m.arm_in) else ""
         delay = f", delay {estimate_text(m.delay_s, 's')}{partly}" if m.delay_s else ""
         subject = f"{_place(analysis, m.junction)}, {m.arm_in} to {m.arm_out}"
@@ -151,9 +152,23 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
     for r in analysis.scene.relations if analysis.scene else ():
         if not r.seen:
             continue  # the table has what is inferred alone
-        share = f", {estimate_text(r.share, '%', 100)} of those from {r.origin.name}" if r.share else ""
+        share = _share_text(r.share, r.vehicles, r.origin.name)
         text = f"{count_text(round(r.vehicles), 'vehicle')}, {r.seen} of them tracked all the way{share}"
         yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
+
+
+def _share_text(share: Estimate | None, vehicles: float, origin: str) -> str:
+    """What share vehicles are of those that come from an origin; nothing where it is not known.
+
+    Examples
+    --------
+    >>> _share_text(Estimate(0.888, 0.817, 0.937, 75), 69.2, "N")
+    ', 89 % (82 to 94) of 78 from N'
+    """
+    if share is None or not share.value:
+        return ""
+    part = f"{100 * share.value:.0f} % ({100 * share.low:.0f} to {100 * share.high:.0f})"
+    return f", {part} of {vehicles / share.value:.0f} from {origin}"
 
 
 def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
@@ -167,6 +182,10 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
     if not known:
         text = "too little data: no road with 8 vehicles that go freely and steadily"
         yield Answer("speed", "", "too little data", text)
+    unknown = sorted(lane for road in analysis.free_flow if not road.speed_m_per_s for lane in road.lanes)
+    if known and (long := [lane for lane in unknown if analysis.lanes.lanes[lane].length_m >= _ROAD_M]):
+        text = "too little data: fewer than 8 vehicles go freely and steadily"
+        yield Answer("speed", lanes_text(long), "too little data", text)
     means = [(flow.lane, mean) for flow in analysis.flows if (mean := flow.space_mean_speed_m_per_s)]
     for lane, mean in sorted(means, key=lambda pair: -pair[1].n):
         text = f"mean {estimate_text(mean, unit, PER_M_PER_S[unit])}, stops and queues included"
@@ -178,16 +197,20 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     if not signal.signalised or signal.cycle_s is None:
         state: State = "too little data" if signal.signalised is None else "none"
         return Answer("signal", subject, state, signal.reason)
-    text = f"cycle {estimate_text(signal.cycle_s, 's')}, {count_text(len(signal.phases), 'phase')}"
+    cycle = signal.cycle_s
+    text = f"cycle {cycle.value:.1f} s ({cycle.low:.1f} to {cycle.high:.1f}), {count_text(len(signal.phases), 'phase')}"
+    first_s = None
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
-        lasts = green_duration_s(streams, signal.cycle_s.value)
+        lasts = green_duration_s(streams, cycle.value)
         long = f" and yellow for {lasts:.0f} s" if lasts else ""
-        begins = estimate_text(streams[0].green_phase_s, "s")
+        begins = streams[0].green_phase_s
+        after = "" if first_s is None else f", {(begins.value - first_s) % cycle.value:.0f} s after the first"
+        first_s = begins.value if first_s is None else first_s
         crossed = np.unique(np.concatenate([s.stream.cross_track for s in streams]))
         text += (
-            f"; {_from_arms(analysis, signal.junction, lanes)}green{long} from {begins} into the cycle, "
-            f"{count_text(len(crossed), 'vehicle')} crossed"
+            f"; {_from_arms(analysis, signal.junction, lanes)}green{long}{after}, seen to begin "
+            f"{count_text(begins.n, 'time')}, {count_text(len(crossed), 'vehicle')} crossed"
         )
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 

@@ -171,7 +171,7 @@ def _space_mean_speed(driven: FloatArray, spent: FloatArray, at: FloatArray) -> 
 
 
 def delay_level(delay_s: Estimate, *, signalised: bool | None, partly: bool) -> str:
-    """Level of service of a mean delay: one, or those that its interval reaches; of a part of a delay the best one.
+    """Level of service of a mean delay: one, or those that its interval reaches; of a part of a delay at least these.
 
     Examples
     --------
@@ -179,9 +179,8 @@ def delay_level(delay_s: Estimate, *, signalised: bool | None, partly: bool) -> 
     'B to C'
     """
     best, worst = (level_of_service(max(end, 0.0), signalised=signalised) for end in (delay_s.low, delay_s.high))
-    if best not in ("", "F") and partly:
-        return f"{best} or worse"
-    return best if best == worst else f"{best} to {worst}"
+    level = best if best == worst else f"{best} to {worst}"
+    return f"{level} or worse" if partly and worst not in ("", "F") else level
 
 
 def level_of_service(delay_s: float, *, signalised: bool | None) -> str:

@@ -66,9 +66,9 @@ def compare_delays(delays: Sequence[ApproachDelay]) -> str:
     >>> east = ApproachDelay("E", Estimate(46, 39, 53, 60), "", (), False)
     >>> west = ApproachDelay("W", Estimate(22, 15, 29, 60), "", (), False)
     >>> compare_delays([east, west])
-    'vehicles from E wait 24 s (14 to 34) longer than those from W'
+    'it is not alike for all: vehicles from E wait 24 s (14 to 34) longer than those from W'
     >>> compare_delays([west, west])
-    'no approach is shown to wait longer than another: 0 s lie between the mean delays'
+    'no approach is shown to wait longer than another: their mean delays are within 0 s'
     """
     if len(delays) < 2:
         return ""
@@ -76,12 +76,12 @@ def compare_delays(delays: Sequence[ApproachDelay]) -> str:
     sd_s = [(d.delay_s.high - d.delay_s.low) / (2 * stats.norm.ppf(0.95)) for d in (longest, shortest)]
     reach_s = float(stats.studentized_range.ppf(0.9, len(delays), np.inf)) * hypot(*sd_s) / sqrt(2)
     by_s = longest.delay_s.value - shortest.delay_s.value
-    part = f",{DELAY_OF_PART}" if longest.partly or shortest.partly else ""
+    part = ", as far as is seen" if longest.partly or shortest.partly else ""
     if by_s < reach_s:
-        return f"no approach is shown to wait longer than another{part}: {by_s:.0f} s lie between the mean delays"
+        return f"no approach is shown to wait longer than another{part}: their mean delays are within {by_s:.0f} s"
     return (
-        f"vehicles from {longest.arm} wait {by_s:.0f} s ({by_s - reach_s:.0f} to {by_s + reach_s:.0f}) longer than "
-        f"those from {shortest.arm}{part}"
+        f"it is not alike for all: vehicles from {longest.arm} wait {by_s:.0f} s ({by_s - reach_s:.0f} to "
+        f"{by_s + reach_s:.0f}) longer than those from {shortest.arm}{part}"
     )
 
 

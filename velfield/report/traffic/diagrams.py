@@ -30,7 +30,8 @@ _MAX_JUNCTIONS = 4
 _SHOWN_S, _SLICE_S = 300.0, 60.0
 _ASIDE_M = 12.0
 _LABEL_AT = (0.33, 0.5, 0.67, 0.2, 0.8, 0.1, 0.9)
-"""Shares of a lane's length at which its number may stand: the first that has room."""
+"""Shares of a lane's length before its first junction at which its number may stand: the first that has room."""
+_NUMBERED_M = 12.0
 _BESIDE_M, _AHEAD_RAD = 2.5, np.radians(45)
 
 
@@ -75,8 +76,8 @@ def traffic_diagrams(
         yield Diagram(
             f"turning-{found.junction.number}",
             f"Junction {found.junction.number}: where vehicles go",
-            "Arrows are as wide as the flow. Vehicles counted, and their share of those that enter by the arm; rare "
-            f"ways: fewer than {MIN_PASSES} were seen to go. "
+            "Arrows are as wide as the flow. Vehicles counted, and their share of those that enter by the arm; by rare "
+            f"ways, if any: fewer than {MIN_PASSES} were seen to go. "
             "Arms are named by the side of the image that they lead to (N: its top).",
             partial(draw_turning, found=found),
             4.6,
@@ -84,25 +85,26 @@ def traffic_diagrams(
         )
         delays = approach_delays(analysis, found)
         if delays:
+            unknown = sorted({m.arm_in for m in found.movements} - {d.arm for d in delays})
             yield Diagram(
                 f"delay-{found.junction.number}",
                 f"Junction {found.junction.number}: delay and level of service by approach",
                 "Mean delay against vehicles that pass freely, in view, up to 150 m before the junction, of those that "
-                "were seen for 60 m; black lines: its 90 % interval. Or worse: the queue ends out of view. "
-                "Level of service by the Highway Capacity Manual, 7th edition (A: best, F: "
-                "worst); dashed: where the next level begins.",
+                "were seen for 60 m; black lines: its 90 % interval. Or worse: the queue ends out of view. Level of "
+                "service by the Highway Capacity Manual, 7th edition (A: best, F: worst), between the dashed lines."
+                + (f" Too few were seen to know it from {' and '.join(unknown)}." if unknown else ""),
                 partial(draw_delays, delays=delays),
-                1.4 + 0.4 * len(delays),
+                1.5 + 0.4 * len(delays),
             )
         yield from _signal_diagrams(analysis, found)
     yield from _road_diagrams(analysis, junctions, unit)
-    likely = [c for c in analysis.conflicts if c.likely]
-    if likely:
+    likely, turns = sum(c.likely for c in analysis.conflicts), len(analysis.reversals)
+    if likely or turns:
         yield Diagram(
             "conflicts",
-            "Where vehicles come near to each other",
-            f"{count_text(len(likely), 'pair')} within 1.5 s of a collision, or of each other, with a probability of "
-            f"{LIKELY} or more.",
+            "Where vehicles come near to each other, and where they turn round",
+            f"{count_text(likely, 'pair')} of vehicles that would have met within 1.5 s, or that passed a place within "
+            f"1.5 s of each other, with a probability of {LIKELY} or more; {count_text(turns, 'U-turn')}.",
             partial(draw_conflicts, analysis=analysis, picture=picture),
             4.6,
             bare=True,
@@ -127,7 +129,7 @@ def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Ite
     )
     yield Diagram(
         f"queue-{number}",
-        f"Junction {number}: queues against time",
+        f"Junction {number}: queues by approach against time",
         "Vehicles that stand from the stop line on, to the first gap: none some seconds after green, when those at the "
         "line have gone. Where a queue ends out of view it is a lower bound.",
         partial(draw_queues, analysis=analysis, streams=streams, names=names),
@@ -185,12 +187,17 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
     arms = analysis.scene.arms if analysis.scene else ()
     taken = [junction.centre_m for junction in analysis.lanes.junctions] + [arm.xy_m for arm in arms]
     apart_m = float(np.abs(np.diff(axes.get_xlim()))[0]) / 28
+    reach_m = {lane.number: lane.length_m for lane in analysis.lanes}
+    for gate in (gate for found in analysis.movements for gate in found.gates.gates if gate.inwards):
+        lane = analysis.lanes.lanes[gate.lane]
+        at_m = float(lane.along_m[np.argmin(np.hypot(*(lane.xy_m - gate.xy_m).T))])
+        reach_m[gate.lane] = min(reach_m[gate.lane], max(at_m, _NUMBERED_M))
     for lane in sorted(analysis.lanes, key=lambda lane: lane.length_m):
-        if lane.length_m >= 12:
+        if lane.length_m >= _NUMBERED_M:
             at = lane.at(lane.length_m / 2), lane.at(lane.length_m / 2 + 3)
             style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 11}
             axes.annotate("", xy=(at[1][0], at[1][1]), xytext=(at[0][0], at[0][1]), arrowprops=style)
-            places = [lane.at(share * lane.length_m) for share in _LABEL_AT]
+            places = [lane.at(share * reach_m[lane.number]) for share in _LABEL_AT]
             free = [min((float(np.hypot(*(place - one))) for one in taken), default=np.inf) for place in places]
             best = int(np.argmax(np.minimum(free, apart_m)))
             taken.append(places[best])
@@ -204,13 +211,15 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
 
 
 def _draw_junctions(axes: "Axes", analysis: TrafficAnalysis, *, aside_m: float = 0.0) -> None:
-    """Numbers of the junctions, small where lanes only merge or part, beside what is drawn there."""
+    """Numbers of the junctions, small where lanes only merge or part, with a line to them from beside what is there."""
     for junction in analysis.lanes.junctions:
         kind = analysis.junction_kind(junction.number)
         box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
         box["linestyle"] = "--" if kind == "crossing" else "-"
         size = 6.5 if kind in ("merge", "diverge") else 11
         x, y = junction.centre_m + aside_m
+        if aside_m:
+            axes.plot(*np.array([junction.centre_m, (x, y)]).T, color="#1b1f24", linewidth=0.8)
         axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=size, fontweight="bold", bbox=box)
 
 
@@ -289,6 +298,10 @@ def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
         label = f"{delay.level}   {delay.delay_s.value:.0f} s, of {delay.delay_s.n} vehicles"
         axes.text(delay.delay_s.high + 0.01 * top, k, label, va="center", fontsize=9, fontweight="bold",
                   bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
+    for letter, low, high in zip("ABCDEF", (0.0, *limits), (*limits, top), strict=False) if limits else ():
+        if low < top:
+            axes.text((low + min(high, top)) / 2, 1.01, letter, transform=axes.get_xaxis_transform(), ha="center",
+                      va="bottom", fontsize=8, color="#4b545d")  # fmt: skip
     axes.set(yticks=range(len(delays)), yticklabels=[f"from {d.arm}" for d in delays], xlabel="delay, s", xlim=(0, top))
     axes.invert_yaxis()
 
@@ -300,11 +313,11 @@ def _window(analysis: TrafficAnalysis) -> tuple[float, float]:
 
 
 def red_times(stream: StreamSignal, cycle_s: float) -> list[tuple[float, float]]:
-    """Begin and end of red of each cycle; none where the onset of red is not known."""
+    """Begin and end of red of each cycle, that after the last green too; none where the onset of red is not known."""
     if stream.red_phase_s is None:
         return []
     length = (stream.green_phase_s.value - stream.red_phase_s.value) % cycle_s
-    return [(float(green - length), float(green)) for green in stream.green_s]
+    return [(float(green - length), float(green)) for green in (*stream.green_s, *stream.green_s[-1:] + cycle_s)]
 
 
 def _cycle_s(analysis: TrafficAnalysis, stream: StreamSignal) -> float:
@@ -345,15 +358,21 @@ def _legend_above(axes: "Axes", columns: int, *, spacing: float = 2.0) -> None:
 
 def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[StreamSignal], names: dict[int, str]) -> None:
     """Vehicles that stand, by approach, against time."""
+    from matplotlib.ticker import MaxNLocator
+
     begin, end = _window(analysis)
     times = np.arange(begin, end, 1.0)
-    for k, stream in enumerate(streams[: len(_TONES)]):
-        lane = stream.stream.approach.lane
+    of = [names.get(s.stream.approach.lane, f"lane {s.stream.approach.lane}") for s in streams]
+    arms = [name.split(",")[0] for name in of]
+    order = sorted(range(len(streams)), key=lambda k: arms[:k].count(arms[k]))  # each approach before second lanes
+    for k, chosen in enumerate(order[: len(_TONES)]):
+        stream = streams[chosen]
         counts = [q.vehicles.value for q in queues(stream.stream, times)]
         axes.step(times, counts, where="post", color=_TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
-                  label=names.get(lane, f"lane {lane}"))  # fmt: skip
+                  label=of[chosen].removeprefix("from "))  # fmt: skip
     axes.set(xlabel="time, s", ylabel="standing vehicles", ylim=(0, None), xlim=(begin, end))
-    _legend_above(axes, 4)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    _legend_above(axes, 6, spacing=0.8)
 
 
 def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, unit: SpeedUnit) -> None:
@@ -417,11 +436,16 @@ def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovemen
 
 
 def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
-    """Conflicts by kind on the map."""
+    """Conflicts by kind, and U-turns, on the map."""
     _draw_map(axes, analysis, picture)
-    likely = [c for c in analysis.conflicts if c.likely]
-    for k, kind in enumerate(sorted({c.kind for c in likely})):
-        at = np.array([c.xy_m for c in likely if c.kind == kind])
-        axes.plot(*at.T, _MARKS[k], color=_RED, markeredgecolor="white", markersize=8, label=f"{kind}: {len(at)}")
     _draw_junctions(axes, analysis, aside_m=_ASIDE_M)
+    likely = [c for c in analysis.conflicts if c.likely]
+    kinds = sorted({c.kind for c in likely})
+    places: dict[str, list[FloatArray]] = {kind: [c.xy_m for c in likely if c.kind == kind] for kind in kinds}
+    places["U-turn"] = [reversal.xy_m for reversal in analysis.reversals]
+    for (kind, at), mark in zip(places.items(), _MARKS, strict=False):
+        tone = _RED if kind != "U-turn" else _TONES[0]
+        if at:
+            axes.plot(*np.array(at).T, mark, color=tone, markeredgecolor="white", markersize=8,
+                      label=f"{kind}: {len(at)}")  # fmt: skip
     axes.legend(frameon=True, fontsize=9, loc="upper left")

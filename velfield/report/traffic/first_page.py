@@ -9,7 +9,8 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.traffic.approaches import approach_delays, compare_delays
 
 _PER_QUESTION = 4
-_NO_DELAY = "delay not known: 10 must be seen for 60 m, 3 of them without a stop"
+_NO_DELAY = "delay not known"
+_WHY_NO_DELAY = "too little data: 10 vehicles must be seen from 60 m before the junction on, and 3 pass without a stop"
 _EVENTS = {
     "conflicts": "conflicts",
     "u-turns": "U-turns",
@@ -51,6 +52,10 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             found.setdefault(answer.topic, []).append(text)
             if answer.topic == "signal" and answer.estimate and fairness.get(answer.subject):
                 found["signal"].append(place + fairness[answer.subject])
+
+    for found_at in _met(analysis):
+        for arm in set(longest_queues(analysis, found_at)) - {d.arm for d in approach_delays(analysis, found_at)}:
+            withheld.append(f"delay: junction {found_at.junction.number} from {arm}: {_WHY_NO_DELAY}")
 
     def why(topic: str, otherwise: str) -> str:
         return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
@@ -95,12 +100,12 @@ def _more(lines: list[str]) -> tuple[str, ...]:
 def _waits(analysis: TrafficAnalysis) -> list[str]:
     """A line on each approach with a known delay or queue: of the junctions with most vehicles first, and of these the
     approach that waits longest."""
-    return [
-        line
-        for found in sorted(analysis.movements, key=lambda m: -m.volume)
-        if analysis.ways_meet(found.junction.number)
-        for line in _approaches(analysis, found)
-    ]
+    return [line for found in _met(analysis) for line in _approaches(analysis, found)]
+
+
+def _met(analysis: TrafficAnalysis) -> list[JunctionMovements]:
+    """Junctions where ways meet, that with most vehicles first."""
+    return sorted((m for m in analysis.movements if analysis.ways_meet(m.junction.number)), key=lambda m: -m.volume)
 
 
 def _approaches(analysis: TrafficAnalysis, found: JunctionMovements) -> list[str]:
@@ -113,6 +118,6 @@ def _approaches(analysis: TrafficAnalysis, found: JunctionMovements) -> list[str
         said = [count_text(round(entered), "vehicle")]
         said.append(f"mean delay {delays[name].text}" if name in delays else _NO_DELAY)
         if name in longest:
-            said.append(f"longest queue when green begins {queue_text(longest[name])}")
+            said.append(f"longest queue of a lane when green begins {queue_text(longest[name])}")
         out.append(f"junction {found.junction.number} from {name}: " + "; ".join(said))
     return out
