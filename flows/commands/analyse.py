@@ -16,6 +16,7 @@ def analyse(
     y_axis: Literal["up", "down"] | None = None,
     slice_s: float = 300.0,
     speed_unit: Literal["km/h", "mph"] = "km/h",
+    arm: tuple[str, ...] = (),
 ) -> int:
     """Lanes, turning counts, speeds, signals, flow, conflicts: write `analysis/` with a report.
 
@@ -39,19 +40,34 @@ def analyse(
         Length of a time slice for counts, seconds; used if the flight is longer than two slices.
     speed_unit
         Unit of speeds in what is printed, the report, the tables and the workbook.
+    arm
+        Name of an arm in place of its direction: `3.W=Mill Road` of junction 3, `W=Mill Road` of a road into the scene.
+        Repeatable.
     """
     from velfield.errors import InputError
     from velfield.pipeline.analysis.analyse import analyse_run, analyse_tracks
 
+    unnamed = [one for one in arm if not all(part.strip() for part in one.partition("=")[::2])]
+    if unnamed:
+        raise InputError(f"--arm {unnamed[0]!r}: expected DIRECTION=NAME, as 3.W='Mill Road' or W='Mill Road'")
+    arms = {key.strip(): name.strip() for key, _, name in (one.partition("=") for one in arm)}
     if (run_folder is None) == (tracks is None):
         raise InputError("give either a run folder or --tracks FILE")
     if tracks is None:
-        lines = analyse_run(Path(run_folder or "."), slice_s=slice_s, speed_unit=speed_unit)
+        lines = analyse_run(Path(run_folder or "."), slice_s=slice_s, speed_unit=speed_unit, arms=arms)
     elif out is None:
         raise InputError(f"--tracks {tracks}: --out is missing, the folder for the report and tables")
     else:
         lines = analyse_tracks(
-            tracks, out, gsd_m=gsd_m, fps=fps, unit=unit, y_axis=y_axis, slice_s=slice_s, speed_unit=speed_unit
+            tracks,
+            out,
+            gsd_m=gsd_m,
+            fps=fps,
+            unit=unit,
+            y_axis=y_axis,
+            slice_s=slice_s,
+            speed_unit=speed_unit,
+            arms=arms,
         )
     for line in lines:
         print(line, flush=True)

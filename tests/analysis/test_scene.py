@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_traffic_analysis import CYCLE_S, EAST, Track, crossroads, drive, gather
+from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.scene import find_scene_gates
 from velfield.analysis.movements.time_slices import slice_edges
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -142,3 +143,14 @@ def test_slices_add_up(whole: TrafficAnalysis) -> None:
 def test_a_short_flight_has_no_slices(whole: TrafficAnalysis) -> None:
     assert len(slice_edges(0.0, 480.0, 300.0)) == 0
     assert TrafficAnalysis(whole.trajectories).counts_by_time == []
+
+
+def test_arms_are_named_by_the_compass_where_north_is_known(whole: TrafficAnalysis) -> None:
+    turned = replace(whole, arm_names=ArmNames(north_rad=0.0))  # north is right in the image
+    name = {"E": "N", "S": "E", "W": "S", "N": "W"}
+    before, after = ({(m.arm_in, m.arm_out) for f in a.movements for m in f.movements} for a in (whole, turned))
+    assert before
+    assert after == {(name[a], name[b]) for a, b in before}
+    assert whole.scene
+    assert turned.scene
+    assert {arm.name for arm in turned.scene.arms} == {name[arm.name] for arm in whole.scene.arms}

@@ -84,6 +84,23 @@ def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str
     assert re.search(r"u-turns +none in \d.* min, so fewer than \d", text)
 
 
+def test_arms_have_the_names_that_are_given(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tracks, out = folder.parent / "tracks.csv", folder.parent / "named"
+    junctions = LanesRecord.model_validate_json((folder / "lanes.json").read_text()).junctions
+    found = [k for k, junction in enumerate(junctions) if junction.signalised]
+    analyse(tracks=tracks, out=out, arm=(f"{found[0]}.W=Mill Road", "W = West end"))
+    text = capsys.readouterr().out
+    assert re.search(rf"junction {found[0]}, Mill Road to E: \d+ vehicles, \d+ % .* from Mill Road", text)
+    assert re.search(r"through +West end to E", text)
+    assert "from Mill Road" in (out / "report.html").read_text()
+    with pytest.raises(InputError, match=rf"--arm 9.W: there is no such arm; there are .*{found[0]}\.W"):
+        analyse(tracks=tracks, out=out, arm=("9.W=Mill Road",))
+    with pytest.raises(InputError, match="two arms would be 'E'"):
+        analyse(tracks=tracks, out=out, arm=(f"{found[0]}.W=E",))
+    with pytest.raises(InputError, match="expected DIRECTION=NAME"):
+        analyse(tracks=tracks, out=out, arm=("Mill Road",))
+
+
 def test_a_short_clip_is_said_to_be_short(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [(k, 0.2 * t, 10.0 * 0.2 * t, 5.0 + k) for k in range(4) for t in range(30)]
     pd.DataFrame(rows, columns=["track_id", "time_s", "x_m", "y_m"]).to_csv(tmp_path / "t.csv", index=False)

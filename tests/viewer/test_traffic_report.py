@@ -28,7 +28,9 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
         r"from W \(lane \d+\): green and yellow for \d+ s, .*, 60 vehicles crossed",
         answers["Is there a signal, and is it fair?"],
     )
-    assert re.search(r"junction \d from W: .*; longest queue when green begins 4 vehicles", " ".join(answers.values()))
+    assert re.search(
+        r"junction \d from W: .*; longest queue of a lane when green begins 4 vehicles", " ".join(answers.values())
+    )
     assert any(line.startswith("classes") for line in page.withheld)
     assert page.sections[-1][0].startswith("What is not known")
 

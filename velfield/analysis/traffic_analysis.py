@@ -1,7 +1,7 @@
 """`TrafficAnalysis`: every question about the tracks of one flight, each answer computed once."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,7 @@ from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.car_parks import CarPark, find_car_parks
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
+from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.movements import JunctionMovements, find_movements
 from velfield.analysis.movements.reversals import Reversal, find_reversals
 from velfield.analysis.movements.scene import OriginDestination, find_origins_destinations
@@ -57,6 +58,8 @@ class TrafficAnalysis:
         (n, 3) position, m, and axial orientation, rad, of parked vehicles; None: not known.
     classes
         Class of the vehicle of each trajectory; None: unknown.
+    arm_names
+        How the arms of junctions and of the scene are named.
 
     Examples
     --------
@@ -71,6 +74,7 @@ class TrafficAnalysis:
     slice_s: float = SLICE_S
     parked: FloatArray | None = None
     classes: VehicleClasses | None = None
+    arm_names: ArmNames = field(default_factory=ArmNames)
 
     @cached_property
     def samples(self) -> PathSamples:
@@ -107,7 +111,7 @@ class TrafficAnalysis:
     @cached_property
     def movements(self) -> tuple[JunctionMovements, ...]:
         """Movements through each junction."""
-        return find_movements(self.trajectories, self.lanes, cut_tracks=self.cut_tracks)
+        return find_movements(self.trajectories, self.lanes, cut_tracks=self.cut_tracks, names=self.arm_names)
 
     @cached_property
     def cut_tracks(self) -> CutTracks:
@@ -117,7 +121,7 @@ class TrafficAnalysis:
     @cached_property
     def scene(self) -> OriginDestination | None:
         """Origins and destinations of the whole scene; None where no road enters it and leaves it."""
-        return find_origins_destinations(self.trajectories, self.samples, self.lanes, self.cut_tracks)
+        return find_origins_destinations(self.trajectories, self.samples, self.lanes, self.cut_tracks, self.arm_names)
 
     @cached_property
     def car_parks(self) -> list[CarPark]:

@@ -15,6 +15,7 @@ from velfield.analysis.bottlenecks import find_bottlenecks
 from velfield.analysis.carriageways import find_carriageways
 from velfield.analysis.lanes.find import MIN_TRACKS, find_lanes
 from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.regions import Regions
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import Trajectories, from_tracklets, moving
@@ -71,12 +72,13 @@ class RunAnalysis:
     @cached_property
     def traffic(self) -> TrafficAnalysis:
         """Answers about lanes, movements, speeds, signals, flow and conflicts: what `velfield analyse` writes."""
-        if self.vehicles is None:
-            return TrafficAnalysis(self.trajectories, classes=self._classes)
-        known = self.vehicles()
-        parked = known.loc[known["state"] == "parked", ["x_px", "y_px", "orientation_rad"]]
-        scale = [self.gsd_m, self.gsd_m, 1.0]
-        return TrafficAnalysis(self.trajectories, parked=parked.to_numpy(np.float64) * scale, classes=self._classes)
+        parked = None
+        if self.vehicles is not None:
+            known = self.vehicles()
+            columns = known.loc[known["state"] == "parked", ["x_px", "y_px", "orientation_rad"]]
+            parked = columns.to_numpy(np.float64) * [self.gsd_m, self.gsd_m, 1.0]
+        names = ArmNames(north_direction_rad(self.grid))
+        return TrafficAnalysis(self.trajectories, parked=parked, classes=self._classes, arm_names=names)
 
     @property
     def _gaps_s(self) -> FloatArray | None:

@@ -1,7 +1,7 @@
 """Gates: where lanes cross the border of a junction, grouped into its arms."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -19,7 +19,7 @@ _REACH_M, _ASIDE_M = 6.0, 2.5
 _ARM_RAD = np.radians(35)
 """Axes of one arm's gates differ by less."""
 _COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
-"""Sides of the image by direction, every 45° from the right, clockwise."""
+"""Names by direction, every 45° clockwise from the right of an image whose top is north."""
 
 
 End: TypeAlias = tuple[int, bool, FloatArray, float]
@@ -39,13 +39,80 @@ class Gate:
 
 @dataclass(frozen=True)
 class Arm:
-    """A road that ends at a junction: ``name`` by the side of the image it leads to, its gates' middle ``xy_m``,
+    """A road that ends at a junction: ``name`` by where it leads to (`ArmNames`), its gates' middle ``xy_m``,
     ``outward_rad`` its direction away from the junction."""
 
     number: int
     name: str
     xy_m: FloatArray
     outward_rad: float
+
+
+@dataclass(frozen=True)
+class ArmNames:
+    """How arms are named: by the compass, or by sides of the image (N: its top) where north is not known.
+
+    Attributes
+    ----------
+    north_rad
+        Direction of north in the image, from x towards y (down); None: not known.
+    given
+        The user's names by these ones: ``{"3.W": "Mill Road"}`` of an arm of junction 3, ``{"W": "Mill Road"}`` of a
+        road by which vehicles enter or leave the scene.
+    """
+
+    north_rad: float | None = None
+    given: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def legend(self) -> str:
+        """What N stands for."""
+        return "N: the top of the image" if self.north_rad is None else "N: north"
+
+    def of(
+        self,
+        outward_rad: Mapping[int, float],
+        xy_m: Mapping[int, FloatArray],
+        inside: Collection[int] = (),
+        *,
+        place: str = "",
+    ) -> dict[int, str]:
+        """Names of arms by their numbers: the direction that each leads to, or ``inside``.
+
+        Several arms of one direction are numbered from the top, or from the left: ``N1``, ``N2``.
+
+        Parameters
+        ----------
+        outward_rad
+            Direction of each arm away from the traffic, rad.
+        xy_m
+            (2,) position of each arm.
+        inside
+            Arms that lead to a place within the scene.
+        place
+            Put before a name to look it up in ``given``.
+
+        Examples
+        --------
+        >>> at = {0: np.array([30.0, 0.0]), 1: np.array([10.0, 0.0]), 2: np.array([90.0, 40.0])}
+        >>> ArmNames().of({0: -1.6, 1: -1.5, 2: 0.0}, at)
+        {0: 'N2', 1: 'N1', 2: 'E'}
+        >>> ArmNames(north_rad=0.0, given={"W1": "Mill Road"}).of({0: -1.6, 1: -1.5, 2: 0.0}, at)
+        {0: 'W2', 1: 'Mill Road', 2: 'N'}
+        """
+        turned = 0.0 if self.north_rad is None else self.north_rad + np.pi / 2
+        side = {
+            k: "inside" if k in inside else _COMPASS[round((a - turned) / (np.pi / 4)) % 8]
+            for k, a in outward_rad.items()
+        }
+        names = dict(side)
+        for name in set(side.values()):
+            members = [k for k in side if side[k] == name]
+            across = (1, 0) if np.ptp([xy_m[k][1] for k in members]) > np.ptp([xy_m[k][0] for k in members]) else (0, 1)
+            members.sort(key=lambda k: tuple(xy_m[k][list(across)]))
+            if len(members) > 1:
+                names.update((k, f"{name}{number}") for number, k in enumerate(members, 1))
+        return {k: self.given.get(place + name, name) for k, name in names.items()}
 
 
 @dataclass(frozen=True)
@@ -79,7 +146,7 @@ class Gates:
         return np.where(near, np.array(rows)[best], -1)
 
 
-def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
+def find_gates(graph: LaneGraph, junction: Junction, names: ArmNames | None = None) -> Gates:
     """Gates and arms of a junction."""
     found: list[End] = []
     roads: list[End] = []
@@ -101,8 +168,12 @@ def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
     order = sorted(range(len(numbers)), key=lambda k: float((outward[k] + np.pi / 2) % (2 * np.pi)))
     rank = {numbers[k]: i for i, k in enumerate(order)}
     gates = tuple(Gate(*f, arm=rank[int(arm)]) for f, arm in zip(found, arms, strict=True))
-    names = name_arms({i: outward[k] for i, k in enumerate(order)}, {i: middles[k] for i, k in enumerate(order)})
-    return Gates(gates, tuple(Arm(i, names[i], middles[k], outward[k]) for i, k in enumerate(order)))
+    name = (names or ArmNames()).of(
+        {i: outward[k] for i, k in enumerate(order)},
+        {i: middles[k] for i, k in enumerate(order)},
+        place=f"{junction.number}.",
+    )
+    return Gates(gates, tuple(Arm(i, name[i], middles[k], outward[k]) for i, k in enumerate(order)))
 
 
 def _middle(xy_m: FloatArray, k: int) -> tuple[FloatArray, float]:
@@ -136,35 +207,3 @@ def group_gates(*places: list[End]) -> IntArray:
 def _of_one_road(a: End, b: End) -> bool:
     turn = abs(float(np.angle(np.exp(1j * (a[3] + np.pi * a[1] - b[3] - np.pi * b[1])))))
     return bool(np.hypot(*(a[2] - b[2])) < _ARM_M and turn < _ARM_RAD)
-
-
-def name_arms(
-    outward_rad: Mapping[int, float], xy_m: Mapping[int, FloatArray], inside: Collection[int] = ()
-) -> dict[int, str]:
-    """Names of arms by their numbers: the side of the image that each leads to, or ``inside``.
-
-    Several arms of one side are numbered from the top, or from the left: ``N1``, ``N2``.
-
-    Parameters
-    ----------
-    outward_rad
-        Direction of each arm away from the traffic, rad.
-    xy_m
-        (2,) position of each arm.
-    inside
-        Arms that lead to a place within the scene.
-
-    Examples
-    --------
-    >>> at = {0: np.array([30.0, 0.0]), 1: np.array([10.0, 0.0]), 2: np.array([90.0, 40.0])}
-    >>> name_arms({0: -1.6, 1: -1.5, 2: 0.0}, at)
-    {0: 'N2', 1: 'N1', 2: 'E'}
-    """
-    side = {k: "inside" if k in inside else _COMPASS[round(a / (np.pi / 4)) % 8] for k, a in outward_rad.items()}
-    names = dict(side)
-    for name in set(side.values()):
-        across = (1, 0) if name in ("E", "W", "inside") else (0, 1)
-        members = sorted((k for k in side if side[k] == name), key=lambda k: tuple(xy_m[k][list(across)]))
-        if len(members) > 1:
-            names.update((k, f"{name}{number}") for number, k in enumerate(members, 1))
-    return names

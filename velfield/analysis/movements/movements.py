@@ -18,7 +18,7 @@ from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, 
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import Junction, LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
-from velfield.analysis.movements.gates import Arm, Gates, find_gates
+from velfield.analysis.movements.gates import Arm, ArmNames, Gates, find_gates
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
@@ -131,7 +131,11 @@ class JunctionMovements:
 
 
 def find_movements(
-    trajectories: Trajectories, graph: LaneGraph, *, cut_tracks: CutTracks | None = None
+    trajectories: Trajectories,
+    graph: LaneGraph,
+    *,
+    cut_tracks: CutTracks | None = None,
+    names: ArmNames | None = None,
 ) -> tuple[JunctionMovements, ...]:
     """Movements through every junction of a lane graph.
 
@@ -139,6 +143,8 @@ def find_movements(
     ----------
     cut_tracks
         Cut tracks of the trajectories, if already known.
+    names
+        How arms are named; None: by sides of the image.
     """
     cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
     samples = cut.samples
@@ -152,7 +158,7 @@ def find_movements(
     waits_elsewhere = np.unique(np.concatenate([_NOWHERE, *meet]))
     out = []
     for junction, rows in zip(graph.junctions, inside, strict=True):
-        gates = find_gates(graph, junction)
+        gates = find_gates(graph, junction, names)
         passes = _passes(samples, rows, gates, waits_elsewhere)
         passes = _within(_by_track(passes, cut), *trajectories.window_s)
         movements = tuple(_count(junction, gates, passes, slices, trajectories.observed_s))

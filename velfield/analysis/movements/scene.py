@@ -19,7 +19,7 @@ from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, 
 from velfield.analysis.lanes.junctions import buffered_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks
-from velfield.analysis.movements.gates import Arm, End, Gate, group_gates, name_arms
+from velfield.analysis.movements.gates import Arm, ArmNames, End, Gate, group_gates
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
@@ -151,7 +151,11 @@ class OriginDestination:
 
 
 def find_origins_destinations(
-    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph, cut_tracks: CutTracks
+    trajectories: Trajectories,
+    samples: PathSamples,
+    graph: LaneGraph,
+    cut_tracks: CutTracks,
+    names: ArmNames | None = None,
 ) -> OriginDestination | None:
     """Origins and destinations of a flight; None where no road enters the scene and leaves it.
 
@@ -163,17 +167,19 @@ def find_origins_destinations(
         Their lanes.
     cut_tracks
         The tracks joined into vehicles.
+    names
+        How arms are named; None: by sides of the image.
     """
     if not len(graph) or not len(samples):
         return None
-    gates, arms = find_scene_gates(trajectories, samples, graph)
+    gates, arms = find_scene_gates(trajectories, samples, graph, names)
     if not any(gate.inwards for gate in gates) or all(gate.inwards for gate in gates):
         return None
     return trace_trips(cut_tracks, graph, gates, arms)
 
 
 def find_scene_gates(
-    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph
+    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph, names: ArmNames | None = None
 ) -> tuple[tuple[Gate, ...], tuple[Arm, ...]]:
     """Entries and exits of the scene, and the arms that they are of."""
     ends = [(lane, True) for lane in graph.entries] + [(lane, False) for lane in graph.exits]
@@ -196,13 +202,11 @@ def find_scene_gates(
         for k in label
     }
     inside = {k for k in middle if _from_border_m(middle[k], graph) > _INSIDE_M}
-    names = name_arms(outward, middle, inside)
-    order = sorted(
-        names, key=lambda k: (names[k].startswith("inside"), (outward[k] + np.pi / 2) % (2 * np.pi), names[k])
-    )
+    name = (names or ArmNames()).of(outward, middle, inside)
+    order = sorted(name, key=lambda k: (k in inside, (outward[k] + np.pi / 2) % (2 * np.pi), name[k]))
     rank = {k: i for i, k in enumerate(order)}
     gates = tuple(Gate(*end, arm=rank[int(of)]) for end, of in zip(used, label, strict=True))
-    return gates, tuple(Arm(i, names[k], middle[k], outward[k]) for i, k in enumerate(order))
+    return gates, tuple(Arm(i, name[k], middle[k], outward[k]) for i, k in enumerate(order))
 
 
 def _faces(a: End, b: End) -> bool:

@@ -77,7 +77,7 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
     kind = analysis.junction_kind(found.junction.number)
     head = [f"{bound(m.arm_in)} {_TURNS[m.turn]}" for m in moves]
     rows: list[list[Any]] = [
-        [f"Junction {found.junction.number} ({kind}); arms by the side of the image, N its top"],
+        [f"Junction {found.junction.number} ({kind}); arms by where they lead to, {analysis.arm_names.legend}"],
         ["From arm, to arm", *(f"{m.arm_in} to {m.arm_out}" for m in moves)],
         ["From the start, min", *head, "All"],
     ]

@@ -12,6 +12,7 @@ from schemas.arrays import GreyImage
 from schemas.export import PER_M_PER_S, SpeedUnit
 from schemas.flight import PAPER_GSD_M, FlightConfig, FramesConfig
 from velfield.analysis.answers import explain_none, find_answers
+from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import make_trajectories, moving
@@ -38,13 +39,25 @@ TRACKS = "tracks"
 MAX_LINES = 12
 
 
-def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: SpeedUnit = "km/h") -> Iterator[str]:
+def analyse_run(
+    run_folder: Path,
+    *,
+    slice_s: float = SLICE_S,
+    speed_unit: SpeedUnit = "km/h",
+    arms: Mapping[str, str] | None = None,
+) -> Iterator[str]:
     """Analyse the tracks of a run and write ``analysis/`` into its folder; a line for people on each question.
+
+    Parameters
+    ----------
+    arms
+        The user's names of arms (`velfield.analysis.movements.gates.ArmNames`).
 
     Raises
     ------
     InputError
-        The folder is not a run folder, its tracks are not computed, or another process writes into it.
+        The folder is not a run folder, its tracks are not computed, another process writes into it, or there is no such
+        arm.
     """
     _check_slice(slice_s)
     run = open_run(run_folder)
@@ -57,8 +70,9 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
                 f"the paper's {PAPER_GSD_M} m a pixel, and wrong by as much as that is; counts hold. Run the flight "
                 "again with --gsd-m"
             )
+        traffic = run.analysis.traffic
         yield from write_analysis(
-            replace(run.analysis.traffic, slice_s=slice_s),
+            replace(traffic, slice_s=slice_s, arm_names=replace(traffic.arm_names, given=arms or {})),
             run.layout.analysis,
             Georeference.from_grid(run.grid),
             about=_about(run),
@@ -109,13 +123,14 @@ def analyse_tracks(
     y_axis: YAxis | None,
     slice_s: float = SLICE_S,
     speed_unit: SpeedUnit = "km/h",
+    arms: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
     """Analyse the tracks of another program and write the answers into ``out``.
 
     Raises
     ------
     InputError
-        As `load_tracks`.
+        As `load_tracks`, or there is no such arm.
     """
     _check_slice(slice_s)
     config = FlightConfig(gsd_m=gsd_m, position_unit=unit, position_y_axis=y_axis, frames=FramesConfig(fps=fps))
@@ -131,7 +146,7 @@ def analyse_tracks(
     tracks = moving(made)
     georeference = Georeference(given.shape, given.crs_wkt, given.affine, given.gsd_m)
     yield from write_analysis(
-        TrafficAnalysis(tracks, slice_s),
+        TrafficAnalysis(tracks, slice_s, arm_names=ArmNames(given=arms or {})),
         to_path(out),
         georeference,
         about=path.name,
@@ -144,6 +159,23 @@ def analyse_tracks(
 def _check_slice(slice_s: float) -> None:
     if not slice_s > 0:
         raise InputError(f"--slice-s {slice_s:g}: must be a positive number of seconds")
+
+
+def _check_names(analysis: TrafficAnalysis) -> None:
+    """Refuse a name of the user's for an arm that there is not, or that another arm of the place has."""
+    given = analysis.arm_names.given
+    places = {f"{found.junction.number}.": found.gates.arms for found in analysis.movements}
+    places[""] = analysis.scene.arms if analysis.scene else ()
+    for place, arms in places.items():
+        names = [arm.name for arm in arms]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"--arm: two arms would be {twice[0]!r}; give each arm a name of its own")
+        given = {key: name for key, name in given.items() if not (key.startswith(place) and name in names)}
+    if given:
+        unnamed = replace(analysis, arm_names=replace(analysis.arm_names, given={}))
+        known = [f"{m.junction.number}.{arm.name}" for m in unnamed.movements for arm in m.gates.arms]
+        known += [arm.name for arm in unnamed.scene.arms] if unnamed.scene else []
+        raise InputError(f"--arm {next(iter(given))}: there is no such arm; there are {', '.join(known) or 'none'}")
 
 
 def write_analysis(
@@ -159,6 +191,7 @@ def write_analysis(
 ) -> Iterator[str]:
     """Write lanes, tables, report and workbook, and strips of pictures of unusual tracks; a line on each."""
     analysis.answer_all()
+    _check_names(analysis)
     gsd_m = analysis.trajectories.gsd_m
     lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis, speed_unit)
     write_atomically(out / "lanes.json", lanes.model_dump_json().encode())

@@ -83,8 +83,9 @@ def relation_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("travel_time", "Travel time", "s", lambda r: r.travel_time_s),
     ]
     note = (
-        "Arms are named by the side of the image that they lead to; “inside” is a yard or a garage. A vehicle whose "
-        "track is cut, and not found again, is taken to go where the others went that drove where it was lost."
+        f"Arms are named by where they lead to ({analysis.arm_names.legend}); “inside” is a yard or a garage. "
+        "A vehicle whose track is cut, and not found again, is taken to go where the others went that drove where it "
+        "was lost."
     )
 
     def place(r: Relation) -> GeometryRecord:

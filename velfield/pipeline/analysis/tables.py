@@ -126,7 +126,8 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     ]
     rows = ((found, m) for found in analysis.movements for m in found.movements)
     note = (
-        "Arms are named by the side of the image. Inferred: a track is cut, and its other end follows from what enters "
+        f"Arms are named by where they lead to ({analysis.arm_names.legend}). "
+        "Inferred: a track is cut, and its other end follows from what enters "
         "and leaves (Furness). Delay is against the fastest tenth of those that do not stop, over the "
         "junction and up to 150 m before it; it is longer where queues end out of view. Level of service: "
         "Highway Capacity Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere; none where it is not "

@@ -57,7 +57,8 @@ def traffic_diagrams(
         "place",
         "The place",
         "Lanes with their direction of travel and their numbers; J: junctions, small where lanes only merge or part; "
-        "in red, the roads by which vehicles enter and leave, N at the top of the image. J3 is junction 3 in the text; "
+        f"in red, the roads by which vehicles enter and leave ({analysis.arm_names.legend}). J3 is junction 3 in the "
+        "text; "
         "a junction's own arms are named likewise by the side that they lead to."
         + (
             " Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn."
@@ -78,7 +79,7 @@ def traffic_diagrams(
             f"Junction {found.junction.number}: where vehicles go",
             "Arrows are as wide as the flow. Vehicles counted, and their share of those that enter by the arm; by rare "
             f"ways, if any: fewer than {MIN_PASSES} were seen to go. "
-            "Arms are named by the side of the image that they lead to (N: its top).",
+            f"Arms are named by where they lead to ({analysis.arm_names.legend}).",
             partial(draw_turning, found=found),
             4.6,
             bare=True,
