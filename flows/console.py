@@ -83,7 +83,7 @@ class StageBars:
         def log(done: int, total: int) -> None:
             nonlocal first
             now_s = time.monotonic()
-            if first[2] != total:
+            if first[2] != total or (done > 0 and not first[1]):  # the first waits for what is read and compiled once
                 first = now_s, done, total
             begin_s, begun, _ = first
             if self.log is not None and done < total and now_s - self.logged_s >= _LINE_EVERY_S:

@@ -6,6 +6,7 @@ import type { Point } from "./coordinates";
 import type { Run } from "./run";
 import { percentile, roundUp, ticks, type Units } from "./units";
 
+const FLOW_OF_S = 60; // in less a platoon may come or not
 const SURE_SPEEDS = 19; // fewer do not bound an 85th percentile
 const PLOT = { width: 280, height: 112, left: 10, bottom: 34, top: 6 };
 
@@ -53,7 +54,7 @@ function oneWay(
   };
   const rows: [string, Node | string][] = [
     ["Vehicles", count],
-    ["Flow", `${Math.round((360 * part.length) / seconds) * 10} an hour${seconds < 300 ? " (short flight: uncertain)" : ""}`],
+    ["Flow", flowText(part.length, seconds)],
     ["15th percentile", speed(15)],
     ["Median speed", speed(50)],
     ["85th percentile", speed(85)],
@@ -61,6 +62,11 @@ function oneWay(
   const seen = part.length === 1 ? "One vehicle" : `${part.length} vehicles`;
   const caution = make("p", { class: "note" }, `${seen} only: the percentiles are uncertain.`);
   return [title, pairs(rows), ...(part.length < SURE_SPEEDS ? [caution] : []), bars(speeds.map((value) => value * units.perPxPerS), top, units.speed)];
+}
+
+function flowText(vehicles: number, seconds: number): string {
+  if (seconds < FLOW_OF_S) return "not known: less than a minute was seen";
+  return `${Math.round((360 * vehicles) / seconds) * 10} an hour${seconds < 300 ? " (short flight: uncertain)" : ""}`;
 }
 
 /** A histogram of speeds, as SVG. */

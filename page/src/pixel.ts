@@ -107,7 +107,10 @@ function rows({ n, values }: PixelAnswer, field: Field, units: Units): [string, 
     ["speed_p50", "Median speed"],
     ["speed_p85", "85th percentile"],
   ] as const) {
-    if (name in values) listed.push([label, speedCell(name, values[name]!, values, units)]);
+    const low = values[`${name}_ci90_lower`]; // of too few vehicles a percentile has no interval, and says nothing
+    if (name in values && (low === undefined || Number.isFinite(low))) {
+      listed.push([label, speedCell(name, values[name]!, values, units)]);
+    }
   }
   if ("stationary_fraction" in values) {
     const fraction = values.stationary_fraction!;

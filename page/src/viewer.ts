@@ -372,7 +372,11 @@ class Viewer {
       this.set({ tracks: checked });
       if (!checked) this.drawings.showTracks([], null);
     });
-    on("replay", "click", () => this.showReplay(this.state.replay === null ? this.replay.time_s : null));
+    on("replay", "click", () => {
+      const begins = this.state.replay === null;
+      this.showReplay(begins ? this.replay.time_s : null);
+      if (begins) this.player.toggle(true);
+    });
     on("flow", "click", () => this.showFlow(!this.state.flow));
     on("draw-line", "click", () => this.draw(this.drawing === null));
     on("whole", "click", () => this.map.fitBounds([[0, 0], [-this.run.height_px, this.run.width_px]]));

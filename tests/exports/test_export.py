@@ -166,3 +166,9 @@ def test_the_certificates_are_kept_and_shown(run: Run) -> None:
     assert (run.layout.maps / "registration.png").exists()
     assert (run.layout.maps / "lens.png").exists() == (not run.frame_transforms.lens.is_identity)
     assert "Registration error" in run.layout.report.read_text()
+
+
+def test_a_file_where_a_folder_is_expected_is_one_line(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file is a file, expected a folder"):
+        export_run(run, "geoparquet", tmp_path / "file" / "out.parquet")

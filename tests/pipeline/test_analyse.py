@@ -101,6 +101,25 @@ def test_arms_have_the_names_that_are_given(folder: Path, capsys: pytest.Capture
         analyse(tracks=tracks, out=out, arm=("Mill Road",))
 
 
+def test_lengths_and_widths_of_a_file_give_classes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = pd.read_csv(folder.parent / "tracks.csv")
+    path = folder.parent / "sizes.csv"
+    is_bus = table["track_id"] % 4 == 0
+    table.assign(length_m=np.where(is_bus, 12.0, 4.4), width_m=np.where(is_bus, 2.5, 1.8)).to_csv(path, index=False)
+    analyse(tracks=path, out=folder.parent / "sizes")
+    found = re.search(r"car or van ([\d.]+) % .* lorry or bus ([\d.]+) %", capsys.readouterr().out)
+    assert found is not None
+    assert [float(share) for share in found.groups()] == pytest.approx([75, 25], abs=1)
+
+
+def test_milliseconds_taken_for_seconds_are_refused(folder: Path) -> None:
+    table = pd.read_csv(folder.parent / "tracks.csv")
+    path = folder.parent / "milliseconds.csv"
+    table.assign(time_s=table["time_s"] * 1000).to_csv(path, index=False)
+    with pytest.raises(InputError, match="check that times are in seconds"):
+        analyse(tracks=path, out=folder.parent / "milliseconds")
+
+
 def test_a_short_clip_is_said_to_be_short(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [(k, 0.2 * t, 10.0 * 0.2 * t, 5.0 + k) for k in range(4) for t in range(30)]
     pd.DataFrame(rows, columns=["track_id", "time_s", "x_m", "y_m"]).to_csv(tmp_path / "t.csv", index=False)

@@ -66,6 +66,7 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
     ("settings", "text"),
     [
         (["tracking.max_sped_m_per_s=20"], "did you mean 'tracking.max_speed_m_per_s'"),
+        (["tracking.foo=3"], "did you mean 'tracking."),
         (["tracking.max_speed_m_per_s=.nan"], "finite"),
         (["tracking.max_speed_m_per_s=.inf"], "finite"),
         (["tracking.max_speed_m_per_s=-1"], "greater than 0"),

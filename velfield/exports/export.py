@@ -76,10 +76,12 @@ def export_run(
     Raises
     ------
     InputError
-        There is no such format, or it needs what the run does not have.
+        There is no such format, it needs what the run does not have, or a file is where a folder is expected.
     """
     module = export_module(format_name)
     path = run.layout.root / "exports" / module.FILE_NAME if out is None else to_path(out)
+    if not is_remote(path) and (files := [above for above in path.parents if above.is_file()]):
+        raise InputError(f"--out {path}: {files[0]} is a file, expected a folder")
     write = getattr(module, "write", None)
     if write is None:
         write_atomically(path, module.encode(run, path, options or ExportOptions()))

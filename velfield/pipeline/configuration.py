@@ -208,7 +208,9 @@ def _unread(section: str, method: str, key: str) -> str:
 
 
 def _did_you_mean(key: str) -> str:
-    close = difflib.get_close_matches(key, list(_keys(FlightConfig)), n=1, cutoff=0.5)
+    keys = list(_keys(FlightConfig))
+    sections = {name.rpartition(".")[0] for name in keys}
+    close = difflib.get_close_matches(key, [name for name in keys if name not in sections], n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else "; `velfield schema` lists the keys"
 
 

@@ -16,13 +16,14 @@ from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import make_trajectories, moving
+from velfield.analysis.vehicle_classes import find_classes
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
 from velfield.pipeline.analysis.clips import Frames, unusual_clips
 from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
 from velfield.pipeline.analysis.tables import all_tables
 from velfield.pipeline.analysis.workbook import workbook_bytes
-from velfield.pipeline.given_tracks.load import load_tracks
+from velfield.pipeline.given_tracks.load import SIZE_SD_M, load_tracks
 from velfield.report.traffic.diagrams import traffic_diagrams
 from velfield.report.traffic.first_page import first_page
 from velfield.report.traffic.report import report_html, report_pdf
@@ -140,13 +141,14 @@ def analyse_tracks(
     ids, frames = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
     time_s = table["time_s"].to_numpy(np.float64)
     made = make_trajectories(ids, frames, time_s, given.xy_m, gsd_m=given.gsd_m, position_sd_m=given.position_sd_m)
-    if "length_m" in table:
-        lengths = table.groupby("track_id")["length_m"].median()
-        made = replace(made, measured_length_m=lengths.reindex(made.track_id).to_numpy(np.float64))
-    tracks = moving(made)
+    tracks = moving(
+        replace(made, measured_length_m=given.sizes_m(made.track_id)[:, 0]) if "length_m" in table else made
+    )
+    sizes_m = given.sizes_m(tracks.track_id)
+    classes = find_classes(sizes_m, np.where(np.isfinite(sizes_m), SIZE_SD_M, np.nan)) if len(tracks) else None
     georeference = Georeference(given.shape, given.crs_wkt, given.affine, given.gsd_m)
     yield from write_analysis(
-        TrafficAnalysis(tracks, slice_s, arm_names=ArmNames(given=arms or {})),
+        TrafficAnalysis(tracks, slice_s, classes=classes, arm_names=ArmNames(given=arms or {})),
         to_path(out),
         georeference,
         about=path.name,

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from rasterio.crs import CRS
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FlightConfig
 from velfield.analysis.speed_changes import PLAUSIBLE_M_PER_S2, check_times
 from velfield.analysis.trajectories import make_trajectories
@@ -23,6 +23,8 @@ MARGIN_M = 10.0
 """Around the positions, where no base image is given."""
 _STEP_S = 0.2
 _CHECKED_TRACKS = 500
+SIZE_SD_M = 0.1
+"""Standard deviation of lengths and widths that a file gives."""
 _INSIDE = 0.5
 """Fewer positions within the base image are of another image."""
 
@@ -58,6 +60,13 @@ class LoadedTracks:
     position_sd_m: float
     displacement_sd_m: float
     notes: tuple[str, ...]
+
+    def sizes_m(self, track_id: IntArray) -> FloatArray:
+        """Length and width (n, 2), m, medians over each of the tracks (n,); NaN where the file does not have them."""
+        by_track = self.table.groupby("track_id")
+        known = [by_track[name].median() for name in ("length_m", "width_m") if name in self.table]
+        columns = [one.reindex(track_id).to_numpy(np.float64) for one in known]
+        return np.column_stack([*columns, *[np.full(len(track_id), np.nan)] * (2 - len(columns))])
 
     @property
     def xy_m(self) -> FloatArray:

@@ -16,7 +16,7 @@ from schemas.flight import FlightConfig
 from schemas.records import GridRecord, WorkingRecord
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.errors import InputError
-from velfield.pipeline.given_tracks.load import LoadedTracks, load_tracks, own_step_s
+from velfield.pipeline.given_tracks.load import SIZE_SD_M, LoadedTracks, load_tracks, own_step_s
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stage import STAGE, stages_before
@@ -190,7 +190,7 @@ def draw_paths(positions: pd.DataFrame, shape: tuple[int, int]) -> GreyImage:
 
 def _write_tables(plan: Plan, given: LoadedTracks, positions: pd.DataFrame, tracklets: pd.DataFrame) -> list[Path]:
     layout, written = plan.layout, []
-    length_m, width_m = (_track_medians(given.table, positions, name) for name in ("length_m", "width_m"))
+    length_m, width_m = given.sizes_m(positions["given_id"].to_numpy(np.int64)).T
     area = np.nan_to_num(length_m, nan=_CAR_M[0]) * np.nan_to_num(width_m, nan=_CAR_M[1]) / given.gsd_m**2
     known = positions.assign(area_px=area, orientation_sd_rad=0.05, score=1.0, source=0)
     known["orientation_rad"] = known["orientation_rad"].astype(np.float64)
@@ -209,7 +209,7 @@ def _write_tables(plan: Plan, given: LoadedTracks, positions: pd.DataFrame, trac
         write_tracks(written[-1], part)
     first = positions.assign(length_m=length_m, width_m=width_m).drop_duplicates("track_id")
     sizes = {f"{a}_px": first[f"{a}_m"] / given.gsd_m for a in ("length", "width")}
-    sd = {f"{a}_sd_px": first[f"{a}_m"] * 0.0 + 0.1 / given.gsd_m for a in ("length", "width")}
+    sd = {f"{a}_sd_px": first[f"{a}_m"] * 0.0 + SIZE_SD_M / given.gsd_m for a in ("length", "width")}
     dimensions = first[["track_id"]].assign(**sizes, **sd, strips=0)
     for path, table, columns in (
         (layout.dimensions, dimensions, DIMENSION_COLUMNS),
@@ -222,10 +222,3 @@ def _write_tables(plan: Plan, given: LoadedTracks, positions: pd.DataFrame, trac
     written.append(layout.tracks / "source_ids.csv")
     write_atomically(written[-1], listed[["track_id", "source_id"]].to_csv(index=False, lineterminator="\n").encode())
     return written
-
-
-def _track_medians(table: pd.DataFrame, positions: pd.DataFrame, name: str) -> FloatArray:
-    """The median of a column over the track of each position; NaN where the file does not have it."""
-    if name not in table:
-        return np.full(len(positions), np.nan)
-    return table.groupby("track_id")[name].median().reindex(positions["given_id"]).to_numpy(np.float64)

@@ -24,6 +24,7 @@ _GAPS_M = 3.5, 12.0
 """Least median, and largest tenth percentile, of the gaps of vehicles that queue."""
 _MOSTLY_SAME = 0.01
 _MIN_EXTENT_M = 6.0
+_FAR_M, _CRAWL_M_PER_S = 20.0, 0.55
 
 
 @dataclass(frozen=True)
@@ -167,20 +168,29 @@ def split_reused(table: pd.DataFrame, xy_m: FloatArray) -> tuple[pd.DataFrame, l
 
 
 def require_motion(path: object, table: pd.DataFrame, xy_m: FloatArray) -> None:
-    """Refuse tracks of which none goes anywhere.
+    """Refuse tracks of which none goes anywhere, or all crawl.
 
     Raises
     ------
     InputError
-        No track moves by 6 m.
+        No track moves by 6 m; or most that drive 20 m never go faster than 2 km/h.
     """
     first = np.flatnonzero(np.r_[True, np.diff(table["track_id"].to_numpy(np.int64)) != 0])
     low, high = (reduce.reduceat(xy_m, first, axis=0) for reduce in (np.minimum, np.maximum))
-    longest = float(np.hypot(*(high - low).T).max())
+    extent = np.hypot(*(high - low).T)
+    longest = float(extent.max())
     if longest < _MIN_EXTENT_M:
         raise InputError(
             f"{path}: found no track that moves {_MIN_EXTENT_M:g} m or more (the longest: {longest:.3g} m), expected "
             "tracks of vehicles; check --unit and --gsd-m"
+        )
+    speed, rows = step_speeds(table, xy_m)
+    of = np.searchsorted(first, rows[:, 0], side="right") - 1
+    fastest = np.maximum.reduceat(speed, np.flatnonzero(np.r_[True, np.diff(of) != 0]))[extent[np.unique(of)] > _FAR_M]
+    if len(fastest) and np.median(fastest) < _CRAWL_M_PER_S:
+        raise InputError(
+            f"{path}: found vehicles that drive {_FAR_M:g} m and more at {3.6 * np.median(fastest):.2g} km/h at most "
+            "by their positions and times; check that times are in seconds (time_s; time_ms for milliseconds, or --fps)"
         )
 
 
