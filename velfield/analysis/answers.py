@@ -89,10 +89,10 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
 def too_short(analysis: TrafficAnalysis) -> str:
     """Explanation that a clip has too few moving vehicles for most questions, with their number and its duration."""
     tracks, seconds = len(analysis.trajectories), analysis.trajectories.duration_s
-    verb = "is" if tracks == 1 else "are"
+    lacks = "too few" if tracks < _FEW_TRACKS else "too short"
     return (
-        f"{count_text(tracks, 'moving vehicle')} in {duration_text(seconds)} {verb} too few for most questions: a "
-        "movement needs 3, free flow 8 that go freely, a signal two cycles"
+        f"{count_text(tracks, 'moving vehicle')} in {duration_text(seconds)}, {lacks} for most questions: a "
+        "movement needs 3 vehicles, free flow 8 that go freely, a rate a minute, a signal two cycles"
     )
 
 

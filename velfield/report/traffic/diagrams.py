@@ -57,8 +57,8 @@ def traffic_diagrams(
         "place",
         "The place",
         "Lanes with their direction of travel and their numbers; J: junctions, small where lanes only merge or part; "
-        f"in red, the roads by which vehicles enter and leave ({analysis.arm_names.legend}). J3 is junction 3 in the "
-        "text; "
+        f"in red, the roads by which vehicles enter and leave ({analysis.arm_names.legend}). J3 is junction 3, or "
+        "crossing 3, in the text; "
         "a junction's own arms are named likewise by the side that they lead to."
         + (
             " Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn."
@@ -207,7 +207,8 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
     _draw_junctions(axes, analysis)
     for arm in arms:
         x, y = arm.xy_m
-        axes.text(x, y, arm.name, ha="center", va="center", fontsize=8, color="#7a1f1f", fontweight="bold")
+        axes.text(x, y, arm.name, ha="center", va="center", fontsize=8, color="#7a1f1f", fontweight="bold",
+                  bbox=_PALE_BOX)  # fmt: skip
     _draw_scale(axes)
 
 

@@ -79,7 +79,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             found.get("speed", []) or found.get("mean speed", []),
             why("speed", "no lane was found"),
         ),
-        ("Where is it dangerous?", events, why("conflicts", "no lane was found")),
+        ("Where is it dangerous?", events, f"conflicts: {why('conflicts', 'no lane was found')}"),
     )
     n = len(analysis.trajectories)
     seen = f"{n} vehicle{'s' if n != 1 else ''} that move, in {duration_text(analysis.trajectories.duration_s)}"
