@@ -210,6 +210,7 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
         axes.text(x, y, arm.name, ha="center", va="center", fontsize=8, color="#7a1f1f", fontweight="bold",
                   bbox=_PALE_BOX)  # fmt: skip
     _draw_scale(axes)
+    _draw_north(axes, analysis.arm_names.north_rad)
 
 
 def _draw_junctions(axes: "Axes", analysis: TrafficAnalysis, *, aside_m: float = 0.0) -> None:
@@ -237,6 +238,19 @@ def _draw_scale(axes: "Axes") -> None:
     axes.plot([x, x + length], [y, y], color="#1b1f24", linewidth=3, solid_capstyle="butt")
     above = y + 0.02 * (top - bottom)
     axes.text(x + length / 2, above, f"{length:g} m", ha="center", va="bottom", fontsize=7, bbox=_PALE_BOX)
+
+
+def _draw_north(axes: "Axes", north_rad: float | None) -> None:
+    """An arrow to the north in the upper right corner, where north is known."""
+    if north_rad is None:
+        return
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    size = 0.05 * (right - left)
+    at = np.array([right - 1.5 * size, top + np.sign(bottom - top) * 1.5 * size])
+    tip = at + size * np.array([np.cos(north_rad), np.sin(north_rad)])
+    style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 14}
+    axes.annotate("N", xy=(tip[0], tip[1]), xytext=(at[0], at[1]), ha="center", va="center", fontsize=8,
+                  arrowprops=style, bbox=_PALE_BOX)  # fmt: skip
 
 
 def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
