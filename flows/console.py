@@ -1,11 +1,12 @@
 """Terminal output: a progress bar for the running stage, one line for each that is done."""
 
 import json
+import logging
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -136,6 +137,16 @@ def print_with_time(text: str) -> None:
     print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)
 
 
+def _log_to_run(level: int, text: str) -> None:
+    """Show a line in the logs of the flow run, or task run, that this is, if any."""
+    if "prefect.context" in sys.modules:
+        from prefect import get_run_logger
+        from prefect.exceptions import MissingContextError
+
+        with suppress(MissingContextError):
+            get_run_logger().log(level, text)
+
+
 class Console:
     """Writes to the terminal: text, or lines of JSON."""
 
@@ -150,6 +161,7 @@ class Console:
             print(json.dumps({"time": time.time(), "event": kind, "text": text, **values}), file=sys.stderr, flush=True)
         elif self.verbosity != "quiet":
             self._rich.print(text, markup=False, soft_wrap=True)
+        _log_to_run(logging.INFO, text)
 
     def warn(self, text: str) -> None:
         """A warning: shown even with ``--quiet``."""
@@ -157,6 +169,7 @@ class Console:
             self.event("warning", text)
         else:
             RichConsole(stderr=True, highlight=False).print(f"warning: {text}", markup=False, soft_wrap=True)
+            _log_to_run(logging.WARNING, text)
 
     def warn_at_end(self, text: str) -> None:
         """A warning for `print_warnings`, so that it does not stand between lines of progress; JSON at once."""

@@ -3,8 +3,13 @@
 import json
 import time
 from types import SimpleNamespace
+from uuid import UUID
 
 import pytest
+from prefect import flow
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import LogFilter, LogFilterFlowRunId
+from prefect.context import FlowRunContext
 
 from flows import console
 from flows.console import Console
@@ -69,3 +74,25 @@ def test_quiet_keeps_warnings_and_a_program_gets_them_at_once(capsys: pytest.Cap
     assert capsys.readouterr().err == "warning: the flight is dark\n"
     Console("json").warn_at_end("the flight is dark")
     assert json.loads(capsys.readouterr().err)["event"] == "warning"
+
+
+def test_lines_stand_in_the_logs_of_the_flow_run(server: None) -> None:
+    @flow
+    def noted() -> UUID:
+        console = Console("normal")
+        console.event("stage", "the lens is straight")
+        console.warn("a frame was lost")
+        context = FlowRunContext.get()
+        assert context is not None
+        assert context.flow_run is not None
+        return context.flow_run.id
+
+    run_id = noted()
+    expected, found = {(20, "the lens is straight"), (30, "a frame was lost")}, set()
+    deadline_s = time.monotonic() + 20
+    with get_client(sync_client=True) as client:
+        while not expected <= found and time.monotonic() < deadline_s:  # they are sent in batches
+            time.sleep(0.2)
+            logs = client.read_logs(LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run_id])))
+            found = {(log.level, log.message) for log in logs}
+    assert expected <= found
