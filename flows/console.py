@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -140,11 +140,9 @@ def print_with_time(text: str) -> None:
 def _log_to_run(level: int, text: str) -> None:
     """Show a line in the logs of the flow run, or task run, that this is, if any."""
     if "prefect.context" in sys.modules:
-        from prefect import get_run_logger
-        from prefect.exceptions import MissingContextError
+        from flows.prefect_flows import log_to_run
 
-        with suppress(MissingContextError):
-            get_run_logger().log(level, text)
+        log_to_run(level, text)
 
 
 class Console:

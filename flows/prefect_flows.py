@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from prefect import flow as prefect_flow
-from prefect import task
+from prefect import get_run_logger, task
 from prefect.cache_policies import NO_CACHE
+from prefect.exceptions import MissingContextError
 from prefect.futures import PrefectFuture
 from prefect.task_runners import ThreadPoolTaskRunner
 
@@ -88,3 +90,9 @@ def _settle(future: "Future[T]", shown: PrefectFuture[T]) -> None:
         future.set_exception(outcome)
     else:
         future.set_exception(RuntimeError(shown.state.message or f"not run ({shown.state.name})"))
+
+
+def log_to_run(level: int, text: str) -> None:
+    """Show a line in the logs of the flow run, or task run, that this is, if any."""
+    with suppress(MissingContextError):
+        get_run_logger().log(level, text)
