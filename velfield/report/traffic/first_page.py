@@ -1,12 +1,13 @@
 """The first page: five questions with their answers, and what could not be said."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
 from velfield.analysis.answers import count_text, duration_text, find_answers, longest_queues, queue_text
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.report.traffic.approaches import approach_delays, compare_delays
+from velfield.report.traffic.approaches import ApproachDelay, approach_delays, compare_delays
 
 _PER_QUESTION = 4
 _NO_DELAY = "delay not known"
@@ -38,10 +39,8 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     found: dict[str, list[str]] = {}
     withheld: list[str] = []
     reasons: dict[str, list[str]] = {}
-    fairness = {
-        f"junction {found.junction.number}": compare_delays(approach_delays(analysis, found))
-        for found in analysis.movements
-    }
+    delays = {found.junction.number: approach_delays(analysis, found) for found in analysis.movements}
+    fairness = {f"junction {number}": compare_delays(known) for number, known in delays.items()}
     for answer in find_answers(analysis, unit=unit):
         place = f"{answer.subject}: " if answer.subject else ""
         text = place + answer.text
@@ -54,7 +53,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
                 found["signal"].append(place + fairness[answer.subject])
 
     for found_at in _met(analysis):
-        for arm in set(longest_queues(analysis, found_at)) - {d.arm for d in approach_delays(analysis, found_at)}:
+        for arm in set(longest_queues(analysis, found_at)) - {d.arm for d in delays[found_at.junction.number]}:
             withheld.append(f"delay: junction {found_at.junction.number} from {arm}: {_WHY_NO_DELAY}")
 
     def why(topic: str, otherwise: str) -> str:
@@ -70,7 +69,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
         ),
         (
             "Which approach waits longest, and how long are the queues?",
-            _waits(analysis),
+            _waits(analysis, delays),
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
         ("Is there a signal, and is it fair?", found.get("signal", []), why("signal", no_junction)),
@@ -97,10 +96,10 @@ def _more(lines: list[str]) -> tuple[str, ...]:
     return (f"and {len(lines) - _PER_QUESTION} more, in the tables",) if len(lines) > _PER_QUESTION else ()
 
 
-def _waits(analysis: TrafficAnalysis) -> list[str]:
+def _waits(analysis: TrafficAnalysis, delays: Mapping[int, list[ApproachDelay]]) -> list[str]:
     """A line on each approach with a known delay or queue: of the junctions with most vehicles first, and of these the
     approach that waits longest."""
-    return [line for found in _met(analysis) for line in _approaches(analysis, found)]
+    return [line for found in _met(analysis) for line in _approaches(analysis, found, delays[found.junction.number])]
 
 
 def _met(analysis: TrafficAnalysis) -> list[JunctionMovements]:
@@ -108,10 +107,10 @@ def _met(analysis: TrafficAnalysis) -> list[JunctionMovements]:
     return sorted((m for m in analysis.movements if analysis.ways_meet(m.junction.number)), key=lambda m: -m.volume)
 
 
-def _approaches(analysis: TrafficAnalysis, found: JunctionMovements) -> list[str]:
+def _approaches(analysis: TrafficAnalysis, found: JunctionMovements, known: list[ApproachDelay]) -> list[str]:
     """A line on each approach of a junction with a known delay or queue."""
     longest = longest_queues(analysis, found)
-    delays = {delay.arm: delay for delay in approach_delays(analysis, found)}
+    delays = {delay.arm: delay for delay in known}
     out = []
     for name in (*delays, *(name for name in longest if name not in delays)):
         entered = sum(m.seen + m.inferred for m in found.movements if m.arm_in == name)
