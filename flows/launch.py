@@ -117,7 +117,7 @@ def use_writable_folders() -> None:
 
 
 def _keep_memory() -> None:
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     for name, (number, size) in _MEMORY.items():
         if name not in os.environ:
             os.environ[name] = str(size)

@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import stat
-import sys
 import tempfile
 import time
 import warnings
@@ -189,8 +188,7 @@ def temporary_cache() -> Path:
         No temporary folder can be written.
     """
     try:
-        # of Windows st_uid is 0 for every file, and the temporary folder is the user's own
-        user = 0 if sys.platform == "win32" else os.getuid()
+        user = os.getuid()
         folder = Path(tempfile.gettempdir()) / f"velfield-{user}"
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()

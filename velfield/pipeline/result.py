@@ -6,7 +6,6 @@ On a worker of a cluster there is no subscriber, and publishing costs nothing; t
 """
 
 import ctypes
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -98,7 +97,7 @@ def commit(plan: "Plan", stage: str, unit: str, result: StageResult, *, started:
 def _return_free_memory() -> None:
     """Return memory that the unit freed to the system, where the C library is glibc, which would keep most of it: the
     next unit is of another stage or size, and what each one leaves would add up to more than any of them takes."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 

@@ -265,7 +265,7 @@ def digest_outputs(layout: RunLayout, paths: Iterable[Path]) -> dict[str, str]:
     # Side by side: a journalling disk writes what waits at the same time in one go.
     with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
         digests = list(pool.map(_digest_synced, files))
-        if not is_remote(layout.root) and os.name == "posix":  # of a new file the folder's entry too
+        if not is_remote(layout.root):  # of a new file the folder's entry too
             list(pool.map(_sync_folder, {path.parent for path in files}))
     return {path.relative_to(layout.root).as_posix(): digest for path, digest in zip(files, digests, strict=True)}
 
@@ -280,6 +280,6 @@ def _sync_folder(folder: Path) -> None:
 
 def _digest_synced(path: Path) -> str:
     if not is_remote(path):
-        with path.open("rb" if os.name == "posix" else "rb+") as file:
+        with path.open("rb") as file:
             os.fsync(file.fileno())
     return digest_file(path)

@@ -5,10 +5,11 @@ The lease is an object that is never removed. Every change of it is one conditio
 """
 
 import _thread
+import errno
+import fcntl
 import json
 import os
 import socket
-import sys
 import threading
 import time
 import uuid
@@ -16,12 +17,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import psutil
 
 from velfield.errors import InputError, parse_json
-from velfield.run.file_lock import try_lock
 from velfield.run.layout import RunLayout, is_remote
 
 if TYPE_CHECKING:
@@ -72,6 +72,23 @@ def locked(layout: RunLayout, lost: Lost = _interrupt) -> Iterator[None]:
             file.flush()
             yield
             return
+
+
+def try_lock(file: IO[str]) -> bool:
+    """Lock an open file until it is closed or this process ends; whether it was free.
+
+    Raises
+    ------
+    OSError
+        The file system has no locks.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.EAGAIN, errno.EACCES):
+            raise
+        return False
+    return True
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
@@ -226,15 +243,12 @@ def _is_expired(text: str) -> bool:
 
 def _has_ended(record: dict[str, Any]) -> bool:
     """Whether the writer of a record is a process of this machine that does not run any more."""
-    # on Windows os.kill(pid, 0) is Ctrl-C
     return machine_id() != "" and record.get("machine") == machine_id() and not psutil.pid_exists(int(record["pid"]))
 
 
 @cache
 def machine_id() -> str:
     """Name the process number space, different for containers of one host name too; empty: not known."""
-    if sys.platform != "linux":
-        return f"{sys.platform} {socket.gethostname()} {uuid.getnode()}"
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot} {os.readlink('/proc/self/ns/pid')}"

@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from hashlib import sha256
 from os import environ
 from pathlib import Path
-from sys import platform
 from typing import TYPE_CHECKING, Any
 
 from velfield.errors import InputError
@@ -170,4 +169,4 @@ def _listen(port: int | None) -> socket.socket:
 
 
 def _has_screen() -> bool:
-    return platform in ("darwin", "win32") or "DISPLAY" in environ or "WAYLAND_DISPLAY" in environ
+    return "DISPLAY" in environ or "WAYLAND_DISPLAY" in environ

@@ -1,5 +1,6 @@
 """``velfield bench speed``: what the whole job and each of its stages cost, against the machine's peak and peers."""
 
+import resource
 import sys
 import tempfile
 import time
@@ -19,14 +20,7 @@ PARTS: tuple[Part, ...] = ("stages", "network", "peers", "workers", "job", "clip
 
 def peak_memory_bytes() -> int:
     """The most memory that this process has had."""
-    if sys.platform == "win32":
-        import psutil
-
-        return int(psutil.Process().memory_info().peak_wset)
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def stages_by_frame() -> list[str]:
