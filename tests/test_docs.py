@@ -84,12 +84,13 @@ def test_the_pages_have_commands_and_snippets() -> None:
 
 
 @pytest.mark.parametrize(("page", "line"), commands())
-def test_a_command_of_the_pages(page: str, line: str, folder: Path) -> None:
+def test_a_command_of_the_pages(page: str, line: str, request: pytest.FixtureRequest) -> None:
     arguments = words(line)
     app.parse_args(arguments, exit_on_error=False, print_error=False)
-    if "--plan" in arguments:
-        shutil.rmtree(folder / "RUN")  # of another video
     if arguments[0] in QUICK or "--plan" in arguments:
+        folder: Path = request.getfixturevalue("folder")
+        if "--plan" in arguments:
+            shutil.rmtree(folder / "RUN")  # of another video
         assert app(arguments, result_action="return_value", exit_on_error=False) == 0
 
 

@@ -55,19 +55,26 @@ def command(
         (("run", "a", "--out", "b", "--gsd-m", "23"), 1, "gsd_m = 23"),
         (("verify", "/dev/null"), 1, "/dev/null"),
         (("view", "s3://runs/flight"), 1, "s3://runs/flight: a run on S3 cannot be shown"),
+        (("run", "http://host/video.mp4", "--out", "out"), 1, "http"),
+        (("run", "a", "--out", "out", "--set", "tracking.max_sped_m_per_s=1"), 1, "did you mean"),
+        (("run", "a", "--out", "out", "--every", "often"), 1, "--every often"),
+        (("simulate", "out", "--size", "big"), 1, "WIDTHxHEIGHT"),
     ],
 )
 def test_a_command_that_cannot_be_is_one_line(
     arguments: tuple[str, ...],
     status: int,
     text: str,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     found, lines = command(monkeypatch, capsys, *arguments)
     assert (found, len(lines)) == (status, 1), lines
     assert lines[0].startswith("velfield: ")
     assert text in lines[0]
+    assert not (tmp_path / "out" / "commits").exists()
 
 
 @pytest.mark.parametrize(

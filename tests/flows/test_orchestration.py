@@ -69,26 +69,38 @@ def test_an_error_of_the_flow_is_raised(by: Orchestration) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "text", "imported"),
+    ("file", "text", "asked"),
     [
         (None, "", False),
         ("pyproject.toml", "[tool.ruff]", False),
+        ("pyproject.toml", "[tool.prefect]", True),
         ("prefect.toml", "", True),
         (".env", "PREFECT_API_URL=", True),
         ("home/profiles.toml", "", True),
     ],
 )
-def test_prefect_is_imported_only_where_its_settings_may_name_a_server(
-    tmp_path: Path, file: str | None, text: str, imported: bool, monkeypatch: pytest.MonkeyPatch
+def test_prefect_is_asked_only_where_its_settings_may_name_a_server(
+    tmp_path: Path, file: str | None, text: str, asked: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "home").mkdir()
     if file is not None:
         (tmp_path / file).write_text(text)
     for name in prefect_server._NAMING_A_SERVER:
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.delitem(sys.modules, "prefect", raising=False)
     monkeypatch.setenv("PREFECT_HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    assert prefect_server._may_name_a_server() == asked
+
+
+def test_prefect_is_not_imported_where_nothing_may_name_a_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in prefect_server._NAMING_A_SERVER:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[2]))
     code = "import sys, flows.process_flight, flows.process_tracks, flows.reprocess, flows.prefect_server as o; "
     code += "print(type(o.choose_orchestration()).__name__, 'prefect' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert done.stdout.split() == ["Threads", str(imported)]
+    assert done.stdout.split() == ["Threads", "False"]
