@@ -36,7 +36,7 @@ TRACKLET_COLUMNS: dict[str, str] = {
     "vy_12_px_per_s": "float64",
     "displacement_sd_01_px": "float32",
     "displacement_sd_12_px": "float32",
-    "sad_01": "float32",  # mean absolute difference of the two oriented patches, grey levels
+    "sad_01": "float32",  # appearance difference of the two detections, grey levels
     "sad_12": "float32",
     "confidence": "float32",  # [0, 1]
 }

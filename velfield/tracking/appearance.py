@@ -8,10 +8,11 @@ shifts. The smallest difference is taken.
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
-from schemas.arrays import ByteArray, FloatArray, IntArray
+from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
 from velfield.compiled import kernel
 
 MAX_PATCH_SHIFT_PX = 2
@@ -24,6 +25,10 @@ CAR_WIDTH_PX = 8.0
 
 _REACH = math.ceil(math.hypot(CAR_LENGTH_PX / 2, CAR_WIDTH_PX / 2))
 """No pixel farther from the centre than this lies on the car, working px."""
+_CHUNK = 64
+"""Pixels of crops that are compared at a time."""
+_HALF_SIDE, _PART = 16, 256
+"""Side and size of a part of a crop."""
 
 
 @dataclass(frozen=True)
@@ -69,53 +74,14 @@ def patch_differences(
     -------
     (k,) float64, grey levels.
     """
-    return np.asarray(_differences(before, after, first, second, max_shift_px), dtype=np.float64)
-
-
-_CHUNK = 64
-"""Pixels that are compared at a time."""
-
-
-@kernel
-def _absolute_sum(before: ByteArray, at: np.uint64, after: ByteArray, to: np.uint64, counted: ByteArray) -> int:
-    """Sum of the absolute differences of 64 pixels from ``before[at]`` and ``after[to]`` on, where ``counted[at]`` has
-    all bits."""
-    total = np.int32(0)
-    for k in range(np.uint64(_CHUNK)):
-        total += abs(np.int32(before[at + k]) - np.int32(after[to + k])) & np.int32(counted[at + k])
-    return int(total)
-
-
-@kernel
-def _differences(before: ByteArray, after: ByteArray, first: IntArray, second: IntArray, shift: int) -> FloatArray:
-    """Patches by columns, so that a shift is an offset in whole chunks; the rest of a chunk is not counted."""
-    length, width = before.shape[1], before.shape[2]
-    size = length * width
-    p, inner = np.zeros(size + _CHUNK, np.uint8), np.zeros(size + _CHUNK, np.uint8)
-    q, rotated = np.zeros(3 * size + _CHUNK, np.uint8), np.zeros(3 * size + _CHUNK, np.uint8)
-    for x in range(shift, width - shift):
-        inner[x * length + shift : (x + 1) * length - shift] = 255
-    begin, end = shift * length, (width - shift) * length
-    counted = (length - 2 * shift) * (width - 2 * shift)
-    out = np.empty(first.size, np.float64)
-    for pair in range(first.size):
-        one, other = before[first[pair]], after[second[pair]]
-        for x in range(width):
-            for y in range(length):
-                p[x * length + y] = one[y, x]
-                q[size + x * length + y] = other[y, x]
-                rotated[2 * size - 1 - x * length - y] = other[y, x]
-        best = counted * 256
-        for moved in (q, rotated):
-            for dx in range(-shift, shift + 1):
-                for dy in range(-shift, shift + 1):
-                    total = 0
-                    for at in range(begin, end, _CHUNK):
-                        to = np.uint64(size + at + dx * length + dy)
-                        total += _absolute_sum(p, np.uint64(at), moved, to, inner)
-                    best = min(best, total)
-        out[pair] = best / counted
-    return out
+    length, width = before.shape[1] - 2 * max_shift_px, before.shape[2] - 2 * max_shift_px
+    inner = before[first, max_shift_px:, max_shift_px:][:, :length, :width].astype(np.int16)
+    other, best = after[second].astype(np.int16), np.full(first.size, 255 * length * width)
+    for turned in (other, other[:, ::-1, ::-1]):
+        for y, x in product(range(2 * max_shift_px + 1), repeat=2):
+            difference = np.abs(inner - turned[:, y : y + length, x : x + width])
+            best = np.minimum(best, difference.reshape(first.size, -1).sum(axis=1))
+    return np.asarray(best / (length * width))
 
 
 @dataclass(frozen=True)
@@ -156,9 +122,30 @@ def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> PreparedCrops:
     """
     if crops.shape[1:] != (2 * _HALF_SIDE, 2 * _HALF_SIDE):
         raise ValueError(f"crops of {crops.shape[1:]} px, expected {2 * _HALF_SIDE} x {2 * _HALF_SIDE}")
+    low, high, middle = crops.copy(), crops.copy(), crops[:, 1:-1, 1:-1]
+    near = [crops[:, 1 + y : 31 + y, 1 + x : 31 + x] for y, x in ((-1, 0), (1, 0), (0, -1), (0, 1))]
+    below, above = middle - np.minimum.reduce([middle, *near]), np.maximum.reduce([middle, *near]) - middle
+    low[:, 1:-1, 1:-1] -= below - below // 2  # half, rounded up: differences of uint8 do not overflow
+    high[:, 1:-1, 1:-1] += above - above // 2
+    on_car = _car_masks(axis_rad)
     spare = np.zeros(len(crops) * _PART * 16 + 2 * _CHUNK, np.uint8)
-    parts = spare[_CHUNK:-_CHUNK].reshape(len(crops), 4, 4, _PART)
-    return PreparedCrops(parts, spare, _prepare(np.ascontiguousarray(crops), axis_rad, parts))
+    parts = spare[_CHUNK:-_CHUNK].reshape(len(crops), 4, 2, 2, _HALF_SIDE, _HALF_SIDE)
+    for k, one in enumerate((crops, low, high, np.where(on_car, np.uint8(255), np.uint8(0)))):
+        parts[:, k] = one.reshape(-1, _HALF_SIDE, 2, _HALF_SIDE, 2).transpose(0, 2, 4, 1, 3)
+    odd = np.asarray(on_car[:, 1::2].any(axis=2))
+    rows = np.stack([odd.argmax(axis=1), _HALF_SIDE - odd[:, ::-1].argmax(axis=1)], axis=1)
+    return PreparedCrops(parts.reshape(len(crops), 4, 4, _PART), spare, rows)
+
+
+def _car_masks(axis_rad: FloatArray) -> Mask:
+    """Pixels (n, 32, 32) on cars of these axes in the middle of their crops; a disc where the axis is NaN."""
+    y, x = np.ogrid[-_REACH : _REACH + 1, -_REACH : _REACH + 1]
+    cos, sin = np.cos(axis_rad)[:, None, None], np.sin(axis_rad)[:, None, None]
+    near = (np.abs(x * cos + y * sin) <= CAR_LENGTH_PX / 2) & (np.abs(y * cos - x * sin) <= CAR_WIDTH_PX / 2)
+    near = np.where(np.isnan(axis_rad)[:, None, None], np.hypot(x, y) <= CAR_WIDTH_PX, near)
+    on_car, box = np.zeros((len(axis_rad), 32, 32), bool), slice(_HALF_SIDE - _REACH, _HALF_SIDE + _REACH + 1)
+    on_car[:, box, box] = near
+    return on_car
 
 
 def crop_differences(before: PreparedCrops, after: PreparedCrops, first: IntArray, second: IntArray) -> FloatArray:
@@ -194,61 +181,7 @@ def _shifts_shortest_first() -> IntArray:
     return np.asarray((2 * (y % 2) + x % 2) * _PART + (y // 2) * _HALF_SIDE + x // 2, dtype=np.int64)
 
 
-_HALF_SIDE, _PART = 16, 256
-"""Side and size of a part of a crop."""
 _SHIFTS = _shifts_shortest_first()
-
-
-@kernel
-def _split_row(row: ByteArray, at: np.uint64, out: ByteArray, to: np.uint64) -> None:
-    """Store the even ones of 32 bytes from ``row[at]`` on from ``out[to]`` on, the odd ones a part farther."""
-    for k in range(np.uint64(_HALF_SIDE)):
-        out[to + k] = row[at + k + k]
-        out[to + np.uint64(_PART) + k] = row[at + k + k + np.uint64(1)]
-
-
-@kernel
-def _prepare(crops: ByteArray, axes: FloatArray, parts: ByteArray) -> IntArray:
-    """Fill in the ``parts`` of `PreparedCrops`; returns its ``rows``."""
-    n, side = crops.shape[0], crops.shape[1]
-    low, high = np.empty((side, side), np.uint8), np.empty((side, side), np.uint8)
-    rows, one, on_car = np.empty((n, 2), np.int64), np.uint64(1), np.empty(side, np.uint8)
-    grey, lowest, highest, out = crops.reshape(-1), low.reshape(-1), high.reshape(-1), parts.reshape(-1)
-    for k in range(n):
-        cos, sin = np.cos(axes[k]), np.sin(axes[k])
-        for y in range(side):
-            for x in range(side):
-                low[y, x] = high[y, x] = crops[k, y, x]
-        for y in range(1, side - 1):
-            above, line, under = crops[k, y - 1], crops[k, y], crops[k, y + 1]
-            low_line, high_line = low[y], high[y]
-            for x in range(one, np.uint64(side - 1)):  # as unsigned, which makes vectors of it
-                here, up, down = np.int32(line[x]), np.int32(above[x]), np.int32(under[x])
-                left, right = np.int32(line[x - one]), np.int32(line[x + one])
-                low_line[x] = (here + min(here, up, down, left, right)) >> 1
-                high_line[x] = (here + max(here, up, down, left, right) + 1) >> 1
-        rows[k, 0], rows[k, 1] = _HALF_SIDE, 0
-        for y in range(side):
-            q, r, dy = 2 * (y % 2), y // 2 * _HALF_SIDE, y - side // 2
-            on_car[:] = 0
-            if abs(dy) <= _REACH:
-                for x in range(np.uint64(2 * _HALF_SIDE)):
-                    dx = np.int32(x) - np.int32(_HALF_SIDE)
-                    along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
-                    is_on = (along <= 0.5 * CAR_LENGTH_PX) & (across <= 0.5 * CAR_WIDTH_PX)
-                    on_car[x] = 255 if is_on else 0
-                if np.isnan(axes[k]):
-                    for x in range(side):
-                        on_car[x] = 255 if np.hypot(x - _HALF_SIDE, dy) <= CAR_WIDTH_PX else 0
-                if y % 2 and on_car.any():
-                    rows[k, 0], rows[k, 1] = min(rows[k, 0], y // 2), y // 2 + 1
-            to, size = np.uint64(((k * 4) * 4 + q) * _PART + r), np.uint64(4 * _PART)
-            at = np.uint64(y * side)
-            _split_row(grey, np.uint64(k * side * side) + at, out, to)
-            _split_row(lowest, at, out, to + size)
-            _split_row(highest, at, out, to + size + size)
-            _split_row(on_car, np.uint64(0), out, to + size + size + size)
-    return rows
 
 
 @kernel

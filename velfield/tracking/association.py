@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
 from schemas.tables import TRACKLET_COLUMNS
-from velfield.compiled import kernel
 from velfield.tracking.crop_alignment import UprightCrops, refine_links
 from velfield.tracking.gates import DetectionStates, Limits
 
@@ -159,7 +158,7 @@ class LinkedTriples:
     detections
         (m, 3) index of the detection in each frame.
     differences
-        (m, 2) mean absolute difference of the patches of both links, grey levels; NaN without patches.
+        (m, 2) appearance difference of both links, grey levels; NaN where unknown.
     confidence
         (m,) in [0, 1].
     """
@@ -339,60 +338,30 @@ def best_triples(triples: Triples, counts: tuple[int, int, int]) -> tuple[Mask, 
         Mutual best: no other triple through any of its detections is as cheap. Confidence in [0, 1]: its likelihood
         over the sum of its own, its competitors' and a false alarm's.
     """
-    best, confidence = _best(triples.detections, triples.cost, np.array(counts), FALSE_ALARM_COST)
-    return best.astype(np.bool_), confidence
+    likelihood = np.exp(-triples.cost)
+    best, competitors = np.ones(triples.cost.size, np.bool_), np.zeros(triples.cost.size)
+    for column, count in zip(triples.detections.T, counts, strict=True):
+        best &= _is_least_alone(triples.cost, column)
+        total = np.bincount(column, likelihood, count)
+        competitors += np.maximum(total[column] - likelihood, 0.0)
+    return best, likelihood / (likelihood + competitors + np.exp(-FALSE_ALARM_COST))
 
 
-@kernel
-def _best(
-    detections: IntArray, cost: FloatArray, counts: IntArray, false_alarm_cost: float
-) -> tuple[ByteArray, FloatArray]:
-    m = cost.size
-    largest = counts.max()
-    minimum = np.full((3, largest), np.inf)
-    ties = np.zeros((3, largest), np.int64)
-    total = np.zeros((3, largest), np.float64)
-    likelihood = np.exp(-cost)
-    for t in range(m):
-        for k in range(3):
-            d = detections[t, k]
-            total[k, d] += likelihood[t]
-            if cost[t] < minimum[k, d]:
-                minimum[k, d] = cost[t]
-                ties[k, d] = 1
-            elif cost[t] == minimum[k, d]:
-                ties[k, d] += 1
-    false_alarm = np.exp(-false_alarm_cost)
-    best = np.empty(m, np.uint8)
-    confidence = np.empty(m, np.float64)
-    for t in range(m):
-        mutual = True
-        competitors = 0.0
-        for k in range(3):
-            d = detections[t, k]
-            mutual = mutual and cost[t] == minimum[k, d] and ties[k, d] == 1
-            competitors += max(total[k, d] - likelihood[t], 0.0)
-        best[t] = mutual
-        confidence[t] = likelihood[t] / (likelihood[t] + competitors + false_alarm)
-    return best, confidence
+def _is_least_alone(values: FloatArray, group: IntArray) -> Mask:
+    """Whether each value is the least of its group (m,), and no other is equal to it."""
+    least = np.full(int(group.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(least, group, values)
+    is_least = values == least[group]
+    return np.asarray(is_least & (np.bincount(group[is_least], minlength=least.size)[group] == 1))
 
 
 def mutual_best_links(differences: FloatArray, first: IntArray, second: IntArray) -> Mask:
-    """Cross-check (paper: tracking): links whose two detections are each most similar in appearance to the other.
+    """Cross-check (paper: tracking): links whose two detections are each most similar in appearance to the other;
+    of two equal differences neither is.
 
     Parameters
     ----------
     differences, first, second
         (m,) of each candidate link: appearance difference, its earlier and its later detection.
     """
-    if not differences.size:
-        return np.zeros(0, np.bool_)
-    of_first = np.full(int(first.max()) + 1, np.inf)
-    of_second = np.full(int(second.max()) + 1, np.inf)
-    np.minimum.at(of_first, first, differences)
-    np.minimum.at(of_second, second, differences)
-    best = (differences == of_first[first]) & (differences == of_second[second])
-    # Of two equal differences neither is the best.
-    alone_first = np.bincount(first[best], minlength=of_first.size)[first] == 1
-    alone_second = np.bincount(second[best], minlength=of_second.size)[second] == 1
-    return np.asarray(best & alone_first & alone_second)
+    return _is_least_alone(differences, first) & _is_least_alone(differences, second)

@@ -21,6 +21,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,6 +53,7 @@ REWEIGHTING_ITERATIONS = 4
 CONVERGENCE_PX = 0.01
 """A step shorter than this ends the iterations."""
 
+_TAPS = cv2.getGaussianKernel(2 * math.ceil(3 * BLUR_SIGMA_PX) + 1, BLUR_SIGMA_PX, cv2.CV_32F)
 _SHIFTS = np.array(
     sorted(
         ((x, y) for y in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1) for x in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1)),
@@ -175,9 +177,26 @@ def refine_links(before: UprightCrops, after: UprightCrops, first: IntArray, sec
 
 def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> AlignableCrops:
     """Prepare crops (n, side, side), uint8, of cars of axes (n,) for alignment; NaN: the weights are a disc."""
-    radius = int(np.ceil(3 * BLUR_SIGMA_PX))
-    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / BLUR_SIGMA_PX) ** 2)
-    return AlignableCrops(*_prepare(crops, axis_rad, (taps / taps.sum()).astype(np.float32)))
+    grey = np.empty(crops.shape, np.float32)
+    for crop, out in zip(crops, grey, strict=True):
+        cv2.sepFilter2D(crop, cv2.CV_32F, _TAPS, _TAPS, out, borderType=cv2.BORDER_REPLICATE)
+    weight = _box_weights(axis_rad)
+    # Pixels that have all neighbours, and lie no farther away on one side than on the other.
+    half = crops.shape[1] // 2
+    low, high = max(0, _REACH + 1 - half), min(_ROWS, crops.shape[1] - 1 - half + _REACH)
+    weight[:, :low], weight[:, high:], weight[:, :, : low + 1], weight[:, :, high + 1 :] = 0.0, 0.0, 0.0, 0.0
+    pixels, counts = _list_pixels(weight)
+    return AlignableCrops(grey, weight, pixels, counts)
+
+
+def _box_weights(axis_rad: FloatArray) -> Float32Array:
+    """Weights (n, 23, 24): one on cars of these axes, tapering to zero around it; a disc where the axis is NaN."""
+    y, x = np.ogrid[-_REACH : _ROWS - _REACH, -_REACH - 1 : _COLUMNS - _REACH - 1]
+    y, x = y.astype(np.float32), x.astype(np.float32)
+    cos, sin = (f(axis_rad).astype(np.float32)[:, None, None] for f in (np.cos, np.sin))
+    beyond = np.maximum(abs(x * cos + y * sin) - 0.5 * CAR_LENGTH_PX, abs(y * cos - x * sin) - 0.5 * CAR_WIDTH_PX)
+    beyond[np.isnan(axis_rad)] = np.hypot(x, y) - CAR_WIDTH_PX
+    return np.asarray(np.clip(1.0 - beyond / TAPER_PX, 0.0, 1.0), np.float32)
 
 
 def align_prepared(before: AlignableCrops, after: AlignableCrops, first: IntArray, second: IntArray) -> FloatArray:
@@ -200,72 +219,18 @@ def align_prepared(before: AlignableCrops, after: AlignableCrops, first: IntArra
 
 
 @kernel
-def _blur(crop: ByteArray, taps: Float32Array, rows: Float32Array, out: Float32Array) -> None:
-    """Fill ``out`` (side, side) with the separably blurred crop, edge values repeated; ``rows`` is scratch."""
-    side, radius = crop.shape[0], taps.size // 2
-    line = np.empty(side + 2 * radius, np.float32)
-    for y in range(side):
-        for x in range(side + 2 * radius):
-            line[x] = crop[y, min(max(x - radius, 0), side - 1)]
-        into = rows[y + radius]
-        into[:] = 0.0
-        for k in range(taps.size):
-            tap, part = taps[k], line[k : k + side]
-            for x in range(np.uint64(side)):
-                into[x] += tap * part[x]
-    for y in range(radius):
-        for x in range(side):
-            rows[y, x], rows[side + radius + y, x] = rows[radius, x], rows[side + radius - 1, x]
-    for y in range(side):
-        into = out[y]
-        into[:] = 0.0
-        for k in range(taps.size):
-            tap, part = taps[k], rows[y + k]
-            for x in range(np.uint64(side)):
-                into[x] += tap * part[x]
-
-
-@kernel
-def _fill_weights(axis: float, out: Float32Array) -> None:
-    """Weights over the box: one on the car, tapering to zero around it; a disc where the axis is unknown."""
-    cos, sin, unknown = np.cos(axis), np.sin(axis), np.isnan(axis)
-    for row in range(_ROWS):
-        dy, line = row - _REACH, out[row]
-        if unknown:
-            for column in range(_COLUMNS):
-                beyond = np.hypot(column - _REACH - 1, dy) - CAR_WIDTH_PX
-                line[column] = min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
-        else:
-            for column in range(np.uint64(_COLUMNS)):
-                dx = np.int32(column) - np.int32(_REACH + 1)
-                along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
-                beyond = max(along - 0.5 * CAR_LENGTH_PX, across - 0.5 * CAR_WIDTH_PX)
-                line[column] = min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
-
-
-@kernel
-def _prepare(
-    crops: ByteArray, axes: FloatArray, taps: Float32Array
-) -> tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray]:
-    """The fields of `AlignableCrops`."""
-    n, side, radius = crops.shape[0], crops.shape[1], taps.size // 2
-    grey, weight = np.empty((n, side, side), np.float32), np.empty((n, _ROWS, _COLUMNS), np.float32)
+def _list_pixels(weight: Float32Array) -> tuple[NDArray[np.int16], IntArray]:
+    """The fields ``pixels`` and ``counts`` of `AlignableCrops`."""
+    n = len(weight)
     pixels, counts = np.empty((n, _ROWS * _COLUMNS // 2), np.int16), np.zeros((n, 3), np.int64)
-    rows = np.empty((side + 2 * radius, side), np.float32)
     on_car = np.empty(_ROWS * _COLUMNS, np.int16)
-    # Pixels that have all neighbours, and lie no farther away on one side than on the other.
-    low, high = max(0, _REACH + 1 - side // 2), min(_ROWS, side - 1 - side // 2 + _REACH)
     for i in range(n):
-        _blur(crops[i], taps, rows, grey[i])
-        _fill_weights(axes[i], weight[i])
-        weight[i, :low], weight[i, high:], weight[i, :, : low + 1], weight[i, :, high + 1 :] = 0.0, 0.0, 0.0, 0.0
         found, first, last = 0, _ROWS, 0
-        for row in range(low, high):
-            line, at = weight[i, row], (row + _MIDDLE - _REACH) * _SIDE + _LEFT
+        for row in range(_ROWS):
             before = found
-            for column in range(np.uint64(_COLUMNS)):
-                on_car[np.uint64(found)] = at + np.int64(column)
-                found += line[column] > 0
+            for column in range(_COLUMNS):
+                on_car[found] = (row + _MIDDLE - _REACH) * _SIDE + _LEFT + column
+                found += weight[i, row, column] > 0
             if found > before:
                 first, last = min(first, row), row + 1
         kept = 0
@@ -274,7 +239,7 @@ def _prepare(
                 pixels[i, kept] = on_car[k]
                 kept += 1
         counts[i, 0], counts[i, 1], counts[i, 2] = kept, min(first, last), last
-    return grey, weight, pixels, counts
+    return pixels, counts
 
 
 @kernel

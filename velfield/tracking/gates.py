@@ -17,7 +17,6 @@ import numpy as np
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import TrackingConfig, assumed_gsd_m
-from velfield.compiled import kernel
 
 
 @dataclass(frozen=True)
@@ -111,6 +110,8 @@ DEFAULT_AXIS_SD_RAD = 0.1
 """Standard deviation of an axis given without one: the structure tensor's (median error 3.4-5 degrees)."""
 MIN_AXIS_SD_RAD = 0.05
 """Lower bound of an axis's standard deviation: cars slip, turn and lean, so motion does not follow the axis exactly."""
+TYPICAL_ACCELERATION_FRACTION = 0.1
+"""Standard deviation of a car's acceleration as a fraction of the gate's limit: 2.3 m/s^2 of 23."""
 
 
 @dataclass(frozen=True)
@@ -188,87 +189,48 @@ def gate_links(before: DetectionStates, after: DetectionStates, limits: Limits) 
     rows = after.y_px[order]
     low = np.searchsorted(rows, before.y_px - 2 * reach, side="left")
     high = np.searchsorted(rows, before.y_px + 2 * reach, side="right")
-    first, second, cost, rejected = _links(
-        before.x_px,
-        before.y_px,
-        before.axis_rad,
-        before.axis_sd_rad,
-        after.x_px,
-        after.y_px,
-        after.axis_rad,
-        after.axis_sd_rad,
-        order,
-        low,
-        high,
-        reach,
-        limits.stationary_speed_px_per_s * interval + widening,
-        limits.max_axis_offset_rad,
-        noise,
-        limits.jitter_sigmas,
-    )
-    ranked = np.lexsort((second, first))
-    counts = (int(rejected[0]), int(rejected[1]), int(rejected[2]))
-    return Links(first[ranked], second[ranked], cost[ranked], interval, counts)
+    first, position = _expand(low, high)
+    second = order[position]
+    length = np.hypot(after.x_px[second] - before.x_px[first], after.y_px[second] - before.y_px[first])
+    tried, near = int(np.sum(length <= 2 * reach)), length <= reach
+    first, second = first[near], second[near]
+    slow = limits.stationary_speed_px_per_s * interval + widening
+    moved = after.x_px[second] - before.x_px[first], after.y_px[second] - before.y_px[first]
+    fits_before, cost_before = _axis_test(*moved, before, first, slow, noise, limits)
+    fits_after, cost_after = _axis_test(*moved, after, second, slow, noise, limits)
+    fits = np.flatnonzero(fits_before & fits_after)
+    ranked = fits[np.lexsort((second[fits], first[fits]))]
+    counts = (tried, tried - len(first), len(first) - len(fits))
+    return Links(first[ranked], second[ranked], 0.5 * (cost_before + cost_after)[ranked], interval, counts)
 
 
-@kernel
-def _axis_offset(dx: float, dy: float, axis: float) -> float:
-    """Angle between a motion and an axis, [0, pi/2]."""
-    along = abs(dx * np.cos(axis) + dy * np.sin(axis))
-    across = abs(dy * np.cos(axis) - dx * np.sin(axis))
-    return float(np.arctan2(across, along))
+def _expand(low: IntArray, high: IntArray) -> tuple[IntArray, IntArray]:
+    """The numbers from ``low`` (n,) up to ``high`` (n,), one range after the other: the range of each, and they."""
+    count = high - low
+    owner = np.repeat(np.arange(len(low)), count)
+    return owner, np.arange(len(owner)) + (low - np.cumsum(count) + count)[owner]
 
 
-@kernel
 def _axis_test(
-    dx: float, dy: float, axis: float, axis_sd: float, slow: float, max_offset: float, noise: float, sigmas: float
-) -> tuple[bool, float]:
-    """Whether motion is along a detection's axis, and half the squared sideways component in standard deviations."""
-    if np.isnan(axis):
-        return True, 0.0
-    sd = DEFAULT_AXIS_SD_RAD if np.isnan(axis_sd) else max(axis_sd, MIN_AXIS_SD_RAD)
+    dx: FloatArray,
+    dy: FloatArray,
+    states: DetectionStates,
+    rows: IntArray,
+    slow: float,
+    noise: float,
+    limits: Limits,
+) -> tuple[Mask, FloatArray]:
+    """Whether motions (m,) are along the axes of detections ``rows`` (m,), and half the squared sideways component in
+    standard deviations."""
+    axis, sd = states.axis_rad[rows], states.axis_sd_rad[rows]
+    sd = np.where(np.isnan(sd), DEFAULT_AXIS_SD_RAD, np.maximum(sd, MIN_AXIS_SD_RAD))
     length = np.hypot(dx, dy)
-    offset = _axis_offset(dx, dy, axis)
-    sideways = length * np.sin(offset)
+    along, sideways = abs(dx * np.cos(axis) + dy * np.sin(axis)), abs(dy * np.cos(axis) - dx * np.sin(axis))
     cost = 0.5 * sideways**2 / (noise**2 + (length * sd) ** 2)
-    if length <= slow:
-        return True, cost
-    return offset <= max_offset + sigmas * np.hypot(sd, noise / length), cost
-
-
-@kernel
-def _links(  # type: ignore[no-untyped-def]
-    x0, y0, a0, s0, x1, y1, a1, s1, order, low, high, reach, slow, max_offset, noise, sigmas
-) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-    """Pairs within reach whose motion is along both axes; counts of the pairs tried and rejected."""
-    capacity = np.sum(high - low)
-    first = np.empty(capacity, np.int64)
-    second = np.empty(capacity, np.int64)
-    cost = np.empty(capacity, np.float64)
-    rejected = np.zeros(3, np.int64)
-    n = 0
-    for i in range(x0.size):
-        for position in range(low[i], high[i]):
-            j = order[position]
-            dx = x1[j] - x0[i]
-            dy = y1[j] - y0[i]
-            length = np.hypot(dx, dy)
-            if length > 2 * reach:
-                continue
-            rejected[0] += 1
-            if length > reach:
-                rejected[1] += 1
-                continue
-            fits_0, cost_0 = _axis_test(dx, dy, a0[i], s0[i], slow, max_offset, noise, sigmas)
-            fits_1, cost_1 = _axis_test(dx, dy, a1[j], s1[j], slow, max_offset, noise, sigmas)
-            if not (fits_0 and fits_1):
-                rejected[2] += 1
-                continue
-            first[n] = i
-            second[n] = j
-            cost[n] = 0.5 * (cost_0 + cost_1)
-            n += 1
-    return first[:n], second[:n], cost[:n], rejected
+    widening = limits.jitter_sigmas * np.hypot(sd, noise / np.maximum(length, 1e-9))
+    fits = (length <= slow) | (np.arctan2(sideways, along) <= limits.max_axis_offset_rad + widening)
+    unknown = np.isnan(axis)
+    return fits | unknown, np.where(unknown, 0.0, cost)
 
 
 @dataclass(frozen=True)
@@ -306,30 +268,22 @@ def gate_link_pairs(
         Limits of the gates.
     """
     begins = np.searchsorted(after.first, np.arange(states[1].x_px.size + 1))
-    link_01, link_12, cost, rejected = _pairs(
-        states[0].x_px,
-        states[0].y_px,
-        states[1].x_px,
-        states[1].y_px,
-        states[2].x_px,
-        states[2].y_px,
-        before.first,
-        before.second,
-        after.second,
-        begins,
-        np.array([before.interval_s, after.interval_s]),
-        np.array([p.sd_px for p in states]),
-        np.array(
-            [
-                limits.max_turn_rad,
-                limits.stationary_speed_px_per_s,
-                limits.max_acceleration_px_per_s2,
-                limits.jitter_sigmas,
-                TYPICAL_ACCELERATION_FRACTION * limits.max_acceleration_px_per_s2,
-            ]
-        ),
-    )
-    return LinkPairs(link_01, link_12, cost, (int(rejected[0]), int(rejected[1]), int(rejected[2])))
+    link_01, link_12 = _expand(begins[before.second], begins[before.second + 1])
+    first, middle, last = before.first[link_01], before.second[link_01], after.second[link_12]
+    ax, ay = states[1].x_px[middle] - states[0].x_px[first], states[1].y_px[middle] - states[0].y_px[first]
+    bx, by = states[2].x_px[last] - states[1].x_px[middle], states[2].y_px[last] - states[1].y_px[middle]
+    dt, sd = (before.interval_s, after.interval_s), np.array([one.sd_px for one in states])
+    goes_on = _turn_passes((ax, ay), (bx, by), dt, sd, limits)
+    # Deviation of the last position from constant velocity's prediction; an acceleration displaces it by `lever` times
+    # its value.
+    ratio, lever = dt[1] / dt[0], dt[1] * 0.5 * (dt[0] + dt[1])
+    noise = float(np.linalg.norm(sd * (ratio, 1 + ratio, 1)))
+    deviation = np.hypot(bx - ratio * ax, by - ratio * ay)
+    steady = deviation <= limits.max_acceleration_px_per_s2 * lever + limits.jitter_sigmas * noise
+    variance = noise**2 + (TYPICAL_ACCELERATION_FRACTION * limits.max_acceleration_px_per_s2 * lever) ** 2
+    kept = np.flatnonzero(goes_on & steady)
+    counts = (len(ax), int(np.sum(~goes_on)), int(np.sum(goes_on & ~steady)))
+    return LinkPairs(link_01[kept], link_12[kept], 0.5 * deviation[kept] ** 2 / variance, counts)
 
 
 def triples_pass(states: tuple[DetectionStates, DetectionStates, DetectionStates], limits: Limits) -> Mask:
@@ -342,62 +296,20 @@ def triples_pass(states: tuple[DetectionStates, DetectionStates, DetectionStates
     return passes
 
 
-TYPICAL_ACCELERATION_FRACTION = 0.1
-"""Standard deviation of a car's acceleration as a fraction of the gate's limit: 2.3 m/s^2 of 23."""
-
-
-@kernel
-def _turn_passes(ax: float, ay: float, bx: float, by: float, dt: FloatArray, sd: FloatArray, limit: FloatArray) -> bool:
-    """Whether the direction changes by no more than the limit between two segments; slow ones have none and pass."""
-    length_a = np.hypot(ax, ay)
-    length_b = np.hypot(bx, by)
-    sigmas = limit[3]
-    if length_a <= limit[1] * dt[0] + sigmas * np.hypot(sd[0], sd[1]):
-        return True
-    if length_b <= limit[1] * dt[1] + sigmas * np.hypot(sd[1], sd[2]):
-        return True
+def _turn_passes(
+    a: tuple[FloatArray, FloatArray],
+    b: tuple[FloatArray, FloatArray],
+    dt: tuple[float, float],
+    sd: FloatArray,
+    limits: Limits,
+) -> Mask:
+    """Whether the direction changes by no more than the limit between two segments (x and y, (m,) each); slow ones have
+    none and pass."""
+    length_a, length_b, sigmas = np.hypot(*a), np.hypot(*b), limits.jitter_sigmas
+    slow = length_a <= limits.stationary_speed_px_per_s * dt[0] + sigmas * np.hypot(sd[0], sd[1])
+    slow |= length_b <= limits.stationary_speed_px_per_s * dt[1] + sigmas * np.hypot(sd[1], sd[2])
     # An error of the middle position changes both directions, in opposite senses.
-    noise = np.sqrt((sd[0] / length_a) ** 2 + (sd[1] * (1 / length_a + 1 / length_b)) ** 2 + (sd[2] / length_b) ** 2)
-    turn = abs(np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
-    return bool(turn <= limit[0] + sigmas * noise)
-
-
-@kernel
-def _pairs(  # type: ignore[no-untyped-def]
-    x0, y0, x1, y1, x2, y2, a_of, b_of, c_of, begins, dt, sd, limit
-) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-    """Pairs of links that share their middle detection; counts of the pairs tried and rejected."""
-    capacity = 0
-    for i in range(b_of.size):
-        capacity += begins[b_of[i] + 1] - begins[b_of[i]]
-    link_01 = np.empty(capacity, np.int64)
-    link_12 = np.empty(capacity, np.int64)
-    cost = np.empty(capacity, np.float64)
-    rejected = np.zeros(3, np.int64)
-    ratio = dt[1] / dt[0]
-    # Deviation of the last position from constant velocity's prediction; an acceleration displaces it by `lever` times
-    # its value.
-    lever = dt[1] * 0.5 * (dt[0] + dt[1])
-    noise = np.sqrt(sd[2] ** 2 + ((1 + ratio) * sd[1]) ** 2 + (ratio * sd[0]) ** 2)
-    max_deviation = limit[2] * lever + limit[3] * noise
-    variance = noise**2 + (limit[4] * lever) ** 2
-    n = 0
-    for i in range(b_of.size):
-        a, b = a_of[i], b_of[i]
-        ax, ay = x1[b] - x0[a], y1[b] - y0[a]
-        for j in range(begins[b], begins[b + 1]):
-            c = c_of[j]
-            bx, by = x2[c] - x1[b], y2[c] - y1[b]
-            rejected[0] += 1
-            if not _turn_passes(ax, ay, bx, by, dt, sd, limit):
-                rejected[1] += 1
-                continue
-            deviation = np.hypot(bx - ratio * ax, by - ratio * ay)
-            if deviation > max_deviation:
-                rejected[2] += 1
-                continue
-            link_01[n] = i
-            link_12[n] = j
-            cost[n] = 0.5 * deviation**2 / variance
-            n += 1
-    return link_01[:n], link_12[:n], cost[:n], rejected
+    per_a, per_b = 1 / np.maximum(length_a, 1e-9), 1 / np.maximum(length_b, 1e-9)
+    noise = np.sqrt((sd[0] * per_a) ** 2 + (sd[1] * (per_a + per_b)) ** 2 + (sd[2] * per_b) ** 2)
+    turn = abs(np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
+    return np.asarray(slow | (turn <= limits.max_turn_rad + sigmas * noise))

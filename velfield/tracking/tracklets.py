@@ -16,7 +16,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 from scipy.special import expit, logit
 
-from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
+from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import TrackingConfig, assumed_gsd_m
 from velfield.errors import InputError
 from velfield.tracking.appearance import AppearanceFeatures, appearance_differences, prepare_crops
@@ -186,12 +186,10 @@ def _select_triples(start: int, frames: _Frames, min_confidence: float, log: Gat
     log.add("confidence", int(np.sum(best & ~accepted)))
     log.add("tracklets", int(np.sum(accepted)))
     selected = np.flatnonzero(accepted)[np.argsort(triples.detections[accepted, 1], kind="stable")]
-    detections = triples.detections[selected]
-    patches = [frames.tables[start + k].patches for k in range(3)]
-    differences = [
-        _patch_differences(patches[k], patches[k + 1], detections[:, k], detections[:, k + 1]) for k in (0, 1)
-    ]
-    return LinkedTriples(start, detections, np.stack(differences, axis=1), confidence[selected])
+    differences = np.stack(
+        [frames.pair(start).differences[pairs.link_01], frames.pair(start + 1).differences[pairs.link_12]], axis=1
+    )
+    return LinkedTriples(start, triples.detections[selected], differences[selected], confidence[selected])
 
 
 def _link_window(start: int, frames: _Frames) -> tuple[LinkPairs, Triples, Mask, FloatArray]:
@@ -244,12 +242,6 @@ def _moving_vehicle(score: FloatArray, likely: FloatArray) -> FloatArray:
     the probability that they belong together."""
     odds = logit(np.clip(likely, 1e-9, 1 - 1e-9))
     return np.asarray(expit(_CONSTANT + _OF_SCORE * score + _OF_ODDS * odds))
-
-
-def _patch_differences(
-    before: ByteArray | None, after: ByteArray | None, first: IntArray, second: IntArray
-) -> FloatArray:
-    return appearance_differences(AppearanceFeatures(before, None), AppearanceFeatures(after, None), first, second)
 
 
 def _triples(
