@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from velfield.analysis.bottlenecks import find_bottlenecks
 from velfield.analysis.carriageways import find_carriageways
 
 
@@ -34,17 +33,3 @@ def test_direction_that_wraps_at_pi_does_not_split_a_carriageway() -> None:
     table = find_carriageways(direction, np.full(direction.shape, 4)).table
     assert len(table) == 1
     assert abs(abs(table.direction_rad[0]) - math.pi) < 0.01
-
-
-def test_a_slow_section_is_a_bottleneck_downstream_of_its_approach() -> None:
-    speed = np.full((40, 200), np.nan)
-    direction = np.full((40, 200), np.nan)
-    speed[15:25], direction[15:25] = 60.0, 0.0
-    speed[15:25, 100:160] = 20.0
-    found = find_bottlenecks(speed, direction, np.full(speed.shape, 9), distance_px=40)
-    labels, table = found.labels, found.table
-    assert len(table) == 1
-    assert abs(table.ratio[0] - 1 / 3) < 0.01
-    assert labels[20, 110] == table.region[0]
-    assert labels[20, 90] == 0
-    assert labels[20, 170] == 0  # faster than upstream: not a bottleneck

@@ -9,7 +9,6 @@ from schemas.arrays import FloatArray
 from velfield.analysis.answers import find_answers
 from velfield.analysis.changes import find_changes
 from velfield.analysis.flow.conflicts import find_conflicts, persistent, positions_on_lanes
-from velfield.analysis.flow.speeds import slowing
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.intervals import estimate_censored_quantile, estimate_quantile, estimate_rate, estimate_share
 from velfield.analysis.movements.gates import Arm, Gate, Gates
@@ -450,16 +449,6 @@ def test_lanes_of_a_phase_that_start_late_together_are_one_observation() -> None
         green.append(phases[0].green_s.low < 12.0 < phases[0].green_s.high)
     assert 0.85 < np.mean(covered) < 0.96
     assert np.mean(green) > 0.9
-
-
-def test_slowing_is_that_of_its_plain_function(analysis: TrafficAnalysis) -> None:
-    samples = analysis.samples
-    first = np.searchsorted(samples.track, np.arange(len(analysis.trajectories) + 1))
-    passes = next(j.passes for j in analysis.movements if j.junction.kind == "intersection")
-    rows = passes.gate_in >= 0
-    arguments = (first, samples.time_s, samples.speed_m_per_s, passes.track[rows], passes.entry_s[rows])
-    assert len(slowing(*arguments)) > 10
-    np.testing.assert_array_equal(slowing(*arguments), slowing.py_func(*arguments))
 
 
 def test_rows_are_grouped_in_order() -> None:

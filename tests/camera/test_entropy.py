@@ -1,7 +1,5 @@
 """The entropy of the Hough histogram against a plain loop, and where its minimum lies."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
 
@@ -31,38 +29,6 @@ def bent_lines(a: float, seed: int, lines: int = 60) -> Arcs:
         frame=np.arange(lines) * 2 // lines,
         length_px=np.full(lines, 100.0),
     )
-
-
-def naive_entropy(arcs: Arcs, lens: HarrisLens, angle_bins: int, distance_bin_px: float | None) -> float:
-    """The definition, point by point: linear binning of angle and distance, one histogram a frame."""
-    histogram: Counter[tuple[int, int, int]] = Counter()
-    xy = lens.undistort_points(arcs.xy)
-    origin, stretch = arcs.xy.mean(axis=0), []
-    for k, (point, tangent) in enumerate(zip(xy, lens.undistort_tangents(arcs.xy, arcs.tangents), strict=True)):
-        frame = int(arcs.frame[arcs.arc[k]])
-        position = (np.arctan2(tangent[1], tangent[0]) % np.pi) / (np.pi / angle_bins)
-        normal = np.array([-tangent[1], tangent[0]]) / np.hypot(*tangent)
-        distance = (point - origin) @ (normal if normal[1] >= 0 else -normal)
-        offset = 0.0 if distance_bin_px is None else distance / distance_bin_px
-        for da in (0, 1):
-            for dd in (0,) if distance_bin_px is None else (0, 1):
-                wa = abs(1 - da - (position - np.floor(position)))
-                wd = 1.0 if distance_bin_px is None else abs(1 - dd - (offset - np.floor(offset)))
-                key = (frame, int(np.floor(position) + da) % angle_bins, int(np.floor(offset)) + dd)
-                histogram[key] += wa * wd
-        radius = np.hypot(*(arcs.xy[k] - origin))
-        stretch.append(np.log(np.hypot(*(point - origin)) / radius) if radius > 1 else 0.0)
-    p = np.array([value for value in histogram.values() if value > 0])
-    p /= p.sum()
-    entropy = float(-(p * np.log(p)).sum())
-    return entropy if distance_bin_px is None else entropy - float(np.mean(stretch))
-
-
-@pytest.mark.parametrize("a", [0.0, 0.2, -0.1])
-def test_the_entropy_is_that_of_the_plain_loop(a: float) -> None:
-    arcs, lens = bent_lines(0.2, 1, lines=20), HarrisLens(a, 319.5, 239.5, HALF)
-    found = hough_entropy(arcs, lens, angle_bins=90, distance_bin_px=2.0)
-    assert found == pytest.approx(naive_entropy(arcs, lens, 90, 2.0), abs=1e-9)
 
 
 def test_the_minimum_is_at_the_lens_that_makes_lines_straight() -> None:

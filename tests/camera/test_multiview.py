@@ -215,13 +215,6 @@ def test_a_hollow_under_a_camera_that_hardly_moves_is_no_lens() -> None:
         assert not refined.accepted, refined.overlap
 
 
-def test_a_lens_that_lines_deny_is_not_brought_in() -> None:
-    refined = refine_lens(lined(0.01, 0.003, accepted=False), flown("along", 0.3, 1))
-    assert not refined.accepted
-    assert refined.overlap is not None
-    assert "disagree" in refined.overlap.reason
-
-
 def test_matches_that_no_plane_explains_are_not_heard() -> None:
     overlap, rng = flown("along", 0.3, 1), np.random.default_rng(0)
     parallax = overlap.xy_j + rng.normal(0, 2.0, overlap.xy_j.shape)
@@ -231,37 +224,11 @@ def test_matches_that_no_plane_explains_are_not_heard() -> None:
     assert "scene not planar" in refined.overlap.reason
 
 
-def test_too_few_frames_change_nothing_and_say_so() -> None:
-    overlap = flown("along", 0.3, 1)
-    few = overlap.select((overlap.frames < 4).all(axis=1))
-    for given in (None, few):
-        refined = refine_lens(lined(0.2, 0.01), given)
-        assert refined.lens == lined(0.2, 0.01).lens
-        assert refined.overlap is not None
-        assert "needed" in refined.overlap.reason
-
-
 def test_the_same_matches_give_the_same_lens_however_linear_algebra_rounds() -> None:
     overlap = flown("turns", 0.2, 1)
     assert refine_lens(lined(0.22, 0.01), overlap) == refine_lens(lined(0.22, 0.01), overlap)
     rounded = replace(overlap, xy_i=overlap.xy_i * (1 + 1e-13))
     assert fitted(rounded) == fitted(overlap)
-
-
-def test_the_deviation_is_that_of_all_that_was_joined() -> None:
-    by_lines = lined(0.22, 0.01)
-    refined = refine_lens(by_lines, flown("turns", 0.2, 1))
-    assert refined.overlap is not None
-    assert refined.overlap.used
-    assert refined.overlap.lines_a_sd == by_lines.a_sd
-    assert refined.overlap.a_sd is not None
-    assert by_lines.a_sd is not None
-    assert refined.a_sd == pytest.approx((by_lines.a_sd**-2 + refined.overlap.a_sd**-2) ** -0.5)
-
-
-def test_a_record_of_before_still_reads() -> None:
-    older = lined(0.2, 0.01).model_dump(exclude={"overlap"})
-    assert CameraRecord.model_validate(older).overlap is None
 
 
 def test_the_paper_knows_straight_lines_alone() -> None:

@@ -11,8 +11,6 @@ import pytest
 from schemas.camera import CameraRecord
 from schemas.flight import LensConfig
 from tests.scenes import city, frame_grid, photograph, rms_after_homography, similarity
-from velfield.camera.edges import detect_arcs, pool_arcs
-from velfield.camera.entropy import hough_entropy
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.camera.plumbline import calibrate
 from velfield.errors import InputError
@@ -46,18 +44,7 @@ def test_ten_frames_give_the_lens_to_half_a_pixel(a: float) -> None:
     assert rms_after_homography(found, true) <= 0.5
 
 
-def test_the_entropy_is_least_near_the_true_distortion(barrel: list[np.ndarray]) -> None:
-    arcs = pool_arcs(
-        [detect_arcs(f, frame=n, min_length_px=24.0, max_curvature_per_px=0.005) for n, f in enumerate(barrel)],
-        max_points=20_000,
-    )
-    grid = np.arange(-0.2, 0.61, 0.1)
-    lenses = [HarrisLens(a, 324.0, 236.0, 400.0) for a in grid]
-    entropy = [hough_entropy(arcs, lens, angle_bins=720, distance_bin_px=2.0) for lens in lenses]
-    assert abs(grid[int(np.argmin(entropy))] - 0.2) < 0.05
-
-
-def test_the_result_says_how_sure_it_is(barrel: list[np.ndarray]) -> None:
+def test_the_result_says_how_sure_it_is_and_is_the_same_again(barrel: list[np.ndarray]) -> None:
     result = calibrate(barrel, QUICK)
     assert result.a_sd is not None
     assert 0 < result.a_sd < 0.02
@@ -67,10 +54,7 @@ def test_the_result_says_how_sure_it_is(barrel: list[np.ndarray]) -> None:
     assert [row.model for row in result.candidates] == ["none", "harris", "division", "polynomial-2", "polynomial-3"]
     record = CameraRecord.model_validate_json(result.to_record().model_dump_json())
     assert record == result.to_record()
-
-
-def test_the_same_frames_give_the_same_lens(barrel: list[np.ndarray]) -> None:
-    assert calibrate(barrel, QUICK) == calibrate(barrel, QUICK)
+    assert calibrate(barrel, QUICK) == result
 
 
 def test_a_pinhole_stays_a_pinhole() -> None:

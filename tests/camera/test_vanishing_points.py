@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from velfield.camera import vanishing_points
 from velfield.camera.lens import HarrisLens
 from velfield.camera.lines import LineSet
 from velfield.camera.straighten import LensFamily, PlumbLineFit
@@ -96,63 +95,3 @@ def test_a_fit_that_is_surer_than_streets_are_parallel_stays() -> None:
     lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 8)
     fit = by_straightness(lines, 0.0005, 1.0)
     assert refine_by_vanishing_points(fit, lines) is fit
-
-
-def undistorted_towards(point: NDArray[np.float64], seed: int, count: int = 30) -> vanishing_points._UndistortedLines:
-    """Lines through a common point, in half-diagonals."""
-    random = np.random.default_rng(seed)
-    midpoint = random.uniform((-0.6, -0.45), (0.6, 0.45), (count, 2))
-    direction = point - midpoint
-    return vanishing_points._UndistortedLines(midpoint, direction / np.linalg.norm(direction, axis=1, keepdims=True))
-
-
-def test_lines_through_a_point_intersect_there() -> None:
-    point = np.array([2.5, -1.5])
-    lines = undistorted_towards(point, 0)
-    pairs = np.random.default_rng(1).integers(0, 30, (2, 200))
-    found = vanishing_points._intersections(lines, pairs)
-    assert len(found) == int((pairs[0] != pairs[1]).sum())  # a line does not intersect itself
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0)
-    np.testing.assert_allclose(found[:, :2] / found[:, 2:], np.tile(point, (len(found), 1)), atol=1e-6)
-
-
-def test_angles_to_the_common_point_are_zero_and_have_a_sign_beside_it() -> None:
-    lines = undistorted_towards(np.array([3.0, 0.0]), 2)
-    at = np.array([3.0, 0.0, 1.0])
-    assert np.abs(vanishing_points._angles(lines, np.arange(30), at)).max() < 1e-9
-    above, below = (vanishing_points._angles(lines, np.arange(30), at + np.array([0.0, dy, 0.0])) for dy in (-0.1, 0.1))
-    assert (above < 0).all()
-    assert (below > 0).all()
-    reverse = vanishing_points._UndistortedLines(lines.midpoint, -lines.direction)
-    np.testing.assert_allclose(vanishing_points._angles(reverse, np.arange(30), at + np.array([0.0, 0.1, 0.0])), below)
-
-
-def test_a_point_at_infinity_is_a_direction() -> None:
-    parallel = vanishing_points._UndistortedLines(np.array([[0.0, 0.0], [0.3, -0.4]]), np.tile([0.6, 0.8], (2, 1)))
-    (point,) = vanishing_points._intersections(parallel, np.array([[0], [1]]))
-    np.testing.assert_allclose(np.abs(point), [0.6, 0.8, 0.0], atol=1e-12)
-    np.testing.assert_allclose(vanishing_points._angles(parallel, np.arange(2), point), 0.0, atol=1e-9)
-
-
-def test_each_direction_of_a_frame_is_a_family_of_its_own_lines() -> None:
-    lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 9, frames=2, crooked_deg=0.05)
-    fit = by_straightness(lines, 0.004, 0.0)
-    families = vanishing_points._find_families(lines, vanishing_points._undistort_lines(lines, fit, TRUTH), 0)
-    assert len(families) == 4
-    for family in families:
-        assert len(family.lines) > 30
-        assert len(set(lines.frame[family.lines].tolist())) == 1
-        assert len({int(line) % 80 // 40 for line in family.lines}) == 1  # of one direction
-
-
-def test_the_equations_of_a_family_are_the_derivatives_of_its_angles() -> None:
-    """With the vanishing point eliminated, a step of the lens leaves the right-hand side of the linear prediction."""
-    lines = streets(np.full(40, 0.3), 10, frames=1, crooked_deg=0.05)
-    fit, off = by_straightness(lines, 0.004, 0.0), TRUTH + np.array([0.02, 0.0, 0.0])
-    families = vanishing_points._find_families(lines, vanishing_points._undistort_lines(lines, fit, TRUTH), 0)
-    (part,) = vanishing_points._linearise_families(lines, fit, off, families[:1])
-    np.testing.assert_allclose(part.normal, part.normal.T, rtol=1e-6)
-    assert np.linalg.eigvalsh(part.normal).min() > -1e-6 * np.linalg.eigvalsh(part.normal).max()
-    (at_truth,) = vanishing_points._linearise_families(lines, fit, TRUTH, families[:1])
-    assert abs(at_truth.right[0]) < 0.5 * abs(part.right[0])
-    assert part.right[0] < 0  # the distortion is too large: the step lowers it

@@ -212,38 +212,6 @@ def test_boxes_cover_the_marked_cells_once_and_cost_no_more_than_one_box(share: 
         assert cost < 0.25 * cells.size
 
 
-def split_by_trying_all(cells: Mask, box: Box, margin: float, box_cost: float) -> tuple[float, list[Box]]:
-    """Cost and boxes: as the docstring of `split_into_boxes` says, with parts down to single cells everywhere."""
-    rows, columns = np.nonzero(cells[box[0] : box[2], box[1] : box[3]])
-    top, left = box[0] + int(rows.min()), box[1] + int(columns.min())
-    bottom, right = box[0] + int(rows.max()) + 1, box[1] + int(columns.max()) + 1
-
-    def area(part: Box) -> float:
-        rows, columns = np.nonzero(cells[part[0] : part[2], part[1] : part[3]])
-        return float((np.ptp(rows) + 1 + 2 * margin) * (np.ptp(columns) + 1 + 2 * margin))
-
-    one = (bottom - top + 2 * margin) * (right - left + 2 * margin) + box_cost, [(top, left, bottom, right)]
-    halves = [((top, left, k, right), (k, left, bottom, right)) for k in range(top + 1, bottom)]
-    halves += [((top, left, bottom, k), (top, k, bottom, right)) for k in range(left + 1, right)]
-    if not halves:
-        return one
-    parts = min(halves, key=lambda pair: sum(map(area, pair)))
-    costs, boxes = zip(*(split_by_trying_all(cells, part, margin, box_cost) for part in parts), strict=True)
-    return (sum(costs), [*boxes[0], *boxes[1]]) if sum(costs) < one[0] else one
-
-
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.3, 0.7, 0.97, 1.0])
-@pytest.mark.parametrize("margin", [1.0, 2.0])
-def test_boxes_are_those_of_trying_all_parts(share: float, margin: float) -> None:
-    for seed in range(4):
-        cells = np.random.default_rng(seed).random((13, 17)) < share
-        cells[4, 5] = True
-        cost, boxes = split_by_trying_all(cells, (0, 0, *cells.shape), margin, 18.75)
-        found = split_into_boxes(cells, margin, 18.75)
-        assert sum((b - t + 2 * margin) * (r - e + 2 * margin) + 18.75 for t, e, b, r in found) == cost
-        assert sorted(found) == sorted(boxes)
-
-
 def test_two_marks_far_apart_are_two_boxes() -> None:
     cells = np.zeros((20, 30), bool)
     cells[2, 3] = cells[17, 25] = True

@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.arrays import FloatArray, GreyImage
-from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn import dataset
 from velfield.detection.cnn.dataset import (
     BATCH_SIZE,
@@ -263,13 +262,6 @@ def test_beyond_the_edge_lies_the_mirror_image_which_is_not_counted() -> None:
         counted = np.flatnonzero(mask.all(axis=0))
         assert 0 < len(counted) < PATCH_PX // STRIDE
         assert abs(len(counted) * STRIDE - len(kept)) <= STRIDE
-
-
-def test_hard_patches_are_an_option_of_pretraining() -> None:
-    sample = simulated_image(9504)
-    plain, hard = PatchDataset([[sample]], [1.0], 0)(0), PatchDataset([[sample]], [1.0], 0, hard=True)(0)
-    assert plain.images.shape == hard.images.shape
-    assert not np.array_equal(plain.images, hard.images)
 
 
 def test_the_gaussian_of_a_bus_is_longer_along_its_axis_alone() -> None:

@@ -64,10 +64,6 @@ def test_positions_and_orientations_are_decoded_from_a_heatmap() -> None:
     assert difference.max() < 1e-3
 
 
-def test_an_image_without_peaks_has_no_detections() -> None:
-    assert detect_cars(network(), np.full((64, 64), 100, np.uint8), None).shape == (0, 5)
-
-
 def test_detections_shift_with_the_image() -> None:
     """Of two crops, where both see as far as the network does."""
     image = simulated_image(9503).image

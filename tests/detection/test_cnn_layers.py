@@ -12,17 +12,13 @@ from scipy.signal import correlate
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage
 from velfield.detection.cnn import layers
-from velfield.detection.cnn.graph import network_from_onnx, network_to_onnx, onnx_kernel, weights_from_onnx
+from velfield.detection.cnn.graph import network_from_onnx, network_to_onnx
 from velfield.detection.cnn.inference import HALO_PX, Predictor, predict_heatmap
-from velfield.detection.cnn.layers import conv2d, conv2d_backward, depth_to_space, relu_backward, space_to_depth
+from velfield.detection.cnn.layers import conv2d, conv2d_backward, relu_backward
 from velfield.detection.cnn.network import (
     STRIDE,
     TOPOLOGY,
-    Conv,
-    DepthToSpace,
     Network,
-    Residual,
-    SpaceToDepth,
     convolutions,
 )
 from velfield.detection.cnn.trainer import Trainer
@@ -142,38 +138,6 @@ def test_a_relu_keeps_what_is_not_a_number() -> None:
     assert np.isnan(conv2d(images, normal(1, 1, 1), np.zeros(1, np.float32), relu=True)).all()
 
 
-def test_space_to_depth_orders_channels_by_row_then_column_of_the_block() -> None:
-    coordinates = np.stack(np.meshgrid(np.arange(4), np.arange(4), indexing="ij"), -1).astype(np.float32)[None]
-    assert space_to_depth(coordinates)[0, 1, 0].tolist() == [2, 0, 2, 1, 3, 0, 3, 1]
-
-
-@settings(max_examples=20)
-@given(st.integers(1, 3), st.integers(1, 5), st.integers(1, 5), CHANNELS)
-def test_depth_to_space_inverts_space_to_depth(n: int, half_h: int, half_w: int, channels: int) -> None:
-    images = normal(n, 2 * half_h, 2 * half_w, channels)
-    deep = space_to_depth(images)
-    assert deep.shape == (n, half_h, half_w, 4 * channels)
-    np.testing.assert_array_equal(depth_to_space(deep), images)
-
-
-def test_channels_and_resolutions_of_the_topology_fit() -> None:
-    def walk(layers: tuple[object, ...], channels: int, stride: float) -> tuple[int, float]:
-        for layer in layers:
-            if isinstance(layer, Conv):
-                assert layer.channels_in == channels, layer.name
-                channels, stride = layer.channels_out, stride * layer.stride
-            elif isinstance(layer, SpaceToDepth):
-                channels, stride = 4 * channels, 2 * stride
-            elif isinstance(layer, DepthToSpace):
-                channels, stride = channels // 4, stride / 2
-            else:
-                assert isinstance(layer, Residual)
-                assert walk(layer.layers, channels, stride) == (channels, stride)
-        return channels, stride
-
-    assert walk(TOPOLOGY, 1, 1) == (3, STRIDE)
-
-
 def test_forward_equals_the_network_written_out_with_scipy() -> None:
     network, image = random_network(), np.random.default_rng(1).random((16, 32))
 
@@ -223,24 +187,6 @@ def test_a_network_comes_back_from_onnx_with_the_same_weights() -> None:
         np.testing.assert_array_equal(again.biases[name], network.biases[name])
 
 
-@pytest.mark.parametrize(("kernel", "block"), [(1, 1), (3, 1), (1, 2), (3, 2), (1, 4)])
-def test_a_strided_kernel_is_a_convolution_of_blocks(kernel: int, block: int) -> None:
-    """Against scipy: the kernel at every ``block``-th pixel equals the layer after space-to-depth."""
-    weights, image = normal(kernel**2, block**2 * 2, 3, seed=4), normal(8, 12, 2, seed=5)
-    strided = onnx_kernel(weights, kernel, block)
-    assert strided.shape == (3, 2, kernel * block, kernel * block)
-    np.testing.assert_array_equal(weights_from_onnx(strided, kernel, block), weights)
-    pad = block * (kernel // 2)
-    padded = np.pad(image, ((pad, pad), (pad, pad), (0, 0)))
-    found = np.zeros((8 // block, 12 // block, 3))
-    for o in range(3):
-        for c in range(2):
-            found[..., o] += correlate(padded[..., c], strided[o, c], mode="valid", method="direct")[::block, ::block]
-    blocks = image.reshape(8 // block, block, 12 // block, block, 2).transpose(0, 2, 1, 3, 4)
-    expected = scipy_conv(blocks.reshape(8 // block, 12 // block, -1), weights)
-    np.testing.assert_allclose(found, expected, atol=1e-4)
-
-
 def test_what_is_no_network_of_ours_is_refused_in_one_line() -> None:
     for data in (b"", b"not a model", network_to_onnx(random_network())[:5000]):
         with pytest.raises(InputError, match="train the detector again"):
@@ -265,14 +211,6 @@ def test_the_onnx_model_is_valid_and_of_few_operators() -> None:
     onnx.checker.check_model(model, full_check=True)
     known = {"Cast", "Mul", "Conv", "Relu", "Add", "DepthToSpace", "Slice", "Sigmoid"}
     assert {node.op_type for node in model.graph.node} == known
-
-
-def test_images_of_a_batch_do_not_touch_each_other() -> None:
-    forward, images = Predictor(random_network()), grey(2, 3, 48, 64)
-    batch = forward(images)
-    for k in range(3):
-        for of_one, of_all in zip(forward(images[k : k + 1]), batch, strict=True):
-            np.testing.assert_allclose(of_one[0], of_all[k], atol=1e-5)
 
 
 def test_a_pixel_reaches_no_farther_than_the_halo_of_a_tile() -> None:

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from schemas.arrays import FloatArray
 from tests.detection.test_cnn_layers import random_network
@@ -197,17 +195,6 @@ def test_the_learning_rate_warms_up_and_decays_along_a_cosine() -> None:
     assert lr_schedule(1) == pytest.approx(1e-3)
 
 
-@settings(max_examples=50)
-@given(st.floats(0, 1), st.floats(0, 1))
-def test_the_learning_rate_rises_then_falls(one: float, other: float) -> None:
-    early, late = sorted((one, other))
-    assert 0 < lr_schedule(early) <= 1.001
-    if late <= 0.1:
-        assert lr_schedule(early) <= lr_schedule(late) + 1.1e-3
-    elif early >= 0.1:
-        assert lr_schedule(early) >= lr_schedule(late)
-
-
 def test_training_follows_the_schedule_and_reports_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
     rates: list[float] = []
     steps: list[tuple[int, float]] = []
@@ -220,13 +207,6 @@ def test_training_follows_the_schedule_and_reports_each_step(monkeypatch: pytest
     assert isinstance(network, Network)
     assert rates == [2 * lr_schedule(k / 4) for k in range(4)]
     assert steps == [(0, 1), (1, 2), (2, 3), (3, 4)]
-
-
-def test_no_steps_leave_a_network_as_it_is() -> None:
-    network = trained().network()
-    same = train(Trainer.from_network(network), lambda _: random_batch(), steps=0, learning_rate=1.0)
-    for name, weights in network.weights.items():
-        np.testing.assert_array_equal(same.weights[name], weights)
 
 
 def test_a_single_batch_can_be_overfitted() -> None:

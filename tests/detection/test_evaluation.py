@@ -48,11 +48,6 @@ def test_greedy_matching_is_the_naive_loop(seed: int, n: int, m: int) -> None:
     assert correct.sum() <= min(n, m)
 
 
-def test_a_second_detection_of_a_car_is_false() -> None:
-    detections = np.array([[10.0, 10.0], [11.0, 10.0], [30.0, 10.0], [10.0, 18.1]])
-    assert match_greedy(detections, np.array([[10.0, 10.0], [37.9, 10.0]])).tolist() == [True, False, True, False]
-
-
 @given(SEEDS)
 @settings(max_examples=30)
 def test_precision_and_recall_are_those_of_a_naive_loop(seed: int) -> None:

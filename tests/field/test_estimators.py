@@ -28,7 +28,6 @@ from velfield.field.modes import (
     speed_cells,
     velocity_modes,
 )
-from velfield.field.prior import PRIOR_PSEUDOCOUNT, STATIONARY_PSEUDOCOUNT, _gaussian_at_rest, _mix_levels
 from velfield.field.segments import SEGMENT_DTYPE
 from velfield.field.statistics import SPEED_CORRELATION, _half_width, _student_t95
 from velfield.field.time_intervals import assign_intervals, parse_time_intervals
@@ -175,14 +174,6 @@ def test_a_change_of_volume_is_a_binomial_test_of_equal_rates(n: int, m: int, ho
     exact = stats.binomtest(m, n + m, hours[1] / sum(hours)).pvalue
     assert change.p_value[0, 0] == pytest.approx(exact, abs=0.04)
     assert np.isnan(compared(layers(count=0), layers(count=0))["volume"].change[0, 0])
-
-
-@given(n=st.integers(0, 1000), level=st.floats(0, 1), coarser=st.floats(0, 1), rest=st.floats(0, 1))
-def test_levels_are_mixed_by_tracks_and_pseudocounts(n: int, level: float, coarser: float, rest: float) -> None:
-    mixed = _mix_levels(float(n), level, coarser, rest, STATIONARY_PSEUDOCOUNT)
-    total = n + PRIOR_PSEUDOCOUNT + STATIONARY_PSEUDOCOUNT
-    assert mixed == pytest.approx((n * level + PRIOR_PSEUDOCOUNT * coarser + STATIONARY_PSEUDOCOUNT * rest) / total)
-    assert _gaussian_at_rest(3.0, 3.0, 3.0, 0.5) == pytest.approx(1 / (2 * np.pi * 0.25))
 
 
 def test_the_gate_of_a_known_gaussian_has_its_moments_and_its_highest_density_region() -> None:

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from velfield.camera.lens import HarrisLens
 from velfield.errors import Failure
-from velfield.registration.fitting import fit_by_case_deletion, fit_polyprojective
+from velfield.registration.fitting import fit_polyprojective
 from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, robust_weights
 from velfield.registration.mesh import fit_mesh, fit_robust_mesh
 from velfield.registration.transforms import HomographyTransform, PolyprojectiveTransform, fit_normalisation
@@ -79,26 +79,6 @@ def test_gauss_newton_reaches_what_the_paper_reaches_by_downhill_simplex() -> No
         best = minimize(of_free, best, method="Nelder-Mead", options={"maxiter": 20_000, "adaptive": True}).x
     assert squares(fast.coefficients) <= of_free(best) * (1 + 1e-6)
     assert of_free(best) == pytest.approx(squares(fast.coefficients), rel=0.02)
-
-
-def test_case_deletion_drops_the_wrong_matches() -> None:
-    rng = np.random.default_rng(2)
-    source = places(rng, 800)
-    target = HomographyTransform(MATRIX)(source) + rng.normal(0, 0.3, (800, 2))
-    wrong = rng.random(800) < 0.1
-    target[wrong] += rng.uniform(-25, 25, (int(wrong.sum()), 2))
-    found = fit_by_case_deletion(source, target, max_mean_error_px=0.5)
-    assert found
-    assert found.inliers[~wrong].mean() > 0.9
-    assert found.inliers[wrong].mean() < 0.05
-    assert found.mean_error_px <= 0.5
-
-
-def test_case_deletion_says_how_many_points_were_left() -> None:
-    rng = np.random.default_rng(3)
-    found = fit_by_case_deletion(places(rng, 100), places(rng, 100), min_control_points=40)
-    assert isinstance(found, Failure)
-    assert "of 100, 40 needed" in found.reason
 
 
 def test_too_few_points_are_a_failure_with_counts() -> None:

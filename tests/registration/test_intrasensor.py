@@ -13,7 +13,7 @@ from schemas.simulation import CameraSimulation, OtherSensorSimulation
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.errors import Failure
 from velfield.registration import frame_fit, intrasensor
-from velfield.registration.alignment import Templates, align_patches, make_templates, smooth_fine
+from velfield.registration.alignment import Templates, align_patches
 from velfield.registration.frame_fit import BaseReference, FrameFitter, FrameRegistration
 from velfield.registration.intrasensor import (
     ChainFrame,
@@ -304,22 +304,6 @@ def test_own_base_of_strange_frames_is_a_failure_with_counts() -> None:
     )
     assert not found
     assert found.reason == "1 of 3 frames overlap with frame 0, 3 needed"
-
-
-@pytest.mark.parametrize("shift_px", [0.0, 0.37, 1.2])
-def test_patches_are_found_below_the_pixel(shift_px: float) -> None:
-    flight = flight_of("still")
-    transform = registered("still", [0])[0].transform
-    templates = make_templates(flight.base_image)
-    target = transform.polyprojective.target + np.array([shift_px, 0.0, 0.0])
-    off = type(transform.polyprojective)(transform.polyprojective.coefficients, transform.polyprojective.source, target)
-    moved = type(transform)(width=640, height=480, lens=transform.lens, polyprojective=off)
-    points, looked_for = align_patches(
-        smooth_fine(seen("still", 0)[0]), moved, templates, coarse=False, max_shift_px=2.5
-    )
-    assert len(points) > 0.7 * looked_for
-    miss = make_truth(flight).to_base(0, points.xy_raw) - points.xy_base
-    assert np.median(np.linalg.norm(miss, axis=1)) < 0.12
 
 
 def test_patches_that_do_not_align_are_tried_in_turn() -> None:

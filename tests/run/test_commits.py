@@ -5,10 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from schemas.flight import FlightConfig, TrackingConfig
+from schemas.flight import TrackingConfig
 from schemas.records import CommitRecord, InputsRecord, SourceRecord
-from velfield.pipeline.configuration import resolve_config
-from velfield.pipeline.stage import STAGE, stage_keys
 from velfield.run.commits import (
     commit_path,
     content_key,
@@ -23,41 +21,6 @@ from velfield.run.commits import (
 from velfield.run.layout import RunLayout
 
 INPUTS = InputsRecord(source=SourceRecord(path="a", kind="video", digest="d", width=10, height=10, frame_count=3))
-
-
-def first_changed(a: dict[str, str], b: dict[str, str]) -> str | None:
-    """The first stage whose key differs; asserts that every later one that reads it differs too."""
-    changed = [stage for stage in STAGE if a[stage] != b[stage]]
-    return changed[0] if changed else None
-
-
-@pytest.mark.parametrize(
-    ("setting", "stage"),
-    [
-        ("frames.every=3", "frames"),
-        ("lens.angle_bins=360", "lens"),
-        ("base.median_frames=32", "base"),
-        ("registration.match_search_px=60", "base"),  # the own base image is made by registration
-        ("detection.fine_tune_steps=100", "detector"),
-        ("tracking.max_turn_rad=0.4", "tracklets"),
-        ("field.bin_width_m_per_s=1", "field"),
-        ("work.retries=5", None),
-    ],
-)
-def test_a_changed_parameter_redoes_what_reads_it_and_what_follows(setting: str, stage: str | None) -> None:
-    keys = stage_keys(resolve_config(), INPUTS)
-    changed = stage_keys(resolve_config(settings=[setting]), INPUTS)
-    assert first_changed(keys, changed) == stage
-    if stage:
-        stages = list(STAGE)
-        later = stages[stages.index(stage) :]
-        assert [s for s in later if keys[s] == changed[s]] == []
-
-
-def test_other_labels_redo_the_detector_and_not_the_registration() -> None:
-    keys = stage_keys(FlightConfig(), INPUTS)
-    changed = stage_keys(FlightConfig(), INPUTS.model_copy(update={"labels": "other"}))
-    assert first_changed(keys, changed) == "detector"
 
 
 def test_keys_do_not_depend_on_the_order_of_fields() -> None:

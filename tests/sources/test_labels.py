@@ -5,14 +5,11 @@ import shutil
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from schemas.tables import LABEL_COLUMNS
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.labels import RAW_DETECTION_COLUMNS, read_detections, read_labels
-from velfield.sources.labels.shapes import length_from_upright_box
 
 FOLDER = SourceInfo("folder", 200, 100, 3, np.arange(3) / 5, ("a.png", "b.png", "c.png"))
 VIDEO = SourceInfo("video", 200, 100, 50, np.arange(50) / 25, tuple(str(index) for index in range(50)))
@@ -65,41 +62,6 @@ def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path
         "classes by classes.txt: cars are car (1); ignored: tree (1)",
         "1 labelled images are no frames of this source: not used",
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("y/classes.txt", "bus\nCar\nfreight-truck\n"),
-        ("y/data.yaml", "names: [bus, car, truck]\n"),
-        ("data.yaml", "names: {0: bus, 1: vehicle-small}\n"),
-    ],
-)
-def test_class_names_say_which_are_cars(tmp_path, name, content):
-    write(tmp_path / name, content)
-    write(tmp_path / "y" / "a.txt", "0 0.5 0.5 0.1 0.05\n1 0.25 0.5 0.1 0.05\n")
-    labels = read_labels(tmp_path / "y", FOLDER)
-    assert labels.cars["x_px"].tolist() == [49.5]
-    assert labels.ignored["x_px"].tolist() == [99.5]
-
-
-def test_oriented_yolo_boxes_tell_axis_length_and_width(tmp_path):
-    angle, centre = math.radians(30), np.array([100.0, 50.0])
-    along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
-    corners = [centre + a * 8 * along + b * 3.5 * across for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    numbers = " ".join(f"{(x + 0.5) / 200} {(y + 0.5) / 100}" for x, y in corners)
-    path = write(tmp_path / "a.txt", f"0 {numbers}\n")
-    (car,) = read_labels(path, FOLDER).cars.to_dict("records")
-    assert (car["x_px"], car["y_px"]) == pytest.approx((100, 50))
-    assert (car["orientation_rad"], car["length_px"], car["width_px"]) == pytest.approx((angle, 16, 7))
-
-
-@given(st.floats(0, math.pi), st.floats(4, 100))
-def test_length_of_a_usual_car_comes_out_of_its_upright_box_at_any_turn(angle, length):
-    width = 0.45 * length
-    w = length * abs(math.cos(angle)) + width * abs(math.sin(angle))
-    h = length * abs(math.sin(angle)) + width * abs(math.cos(angle))
-    assert length_from_upright_box(w, h) == pytest.approx(length, rel=1e-6)
 
 
 @pytest.mark.parametrize(

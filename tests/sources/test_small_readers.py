@@ -217,14 +217,6 @@ def test_places_that_share_only_their_layout_are_two_places() -> None:
     assert np.flatnonzero(flag_outlier_frames(np.stack([here] * 4 + [there] + [here] * 4))).tolist() == [4]
 
 
-def test_a_dark_frame_and_fog_are_black() -> None:
-    rng = np.random.default_rng(0)
-    scene = rng.integers(0, 256, (60, 80)).astype(np.uint8)
-    assert not is_black(scene)
-    assert is_black((scene // 32).astype(np.uint8))
-    assert is_black(np.full((60, 80), 180, np.uint8))
-
-
 def test_a_header_that_is_damaged_or_declares_too_much_is_refused_before_any_pixel(tmp_path: Path) -> None:
     (tmp_path / "a.bmp").write_bytes(b"BM" + bytes(8))
     with pytest.raises(InputError, match="the image's header is damaged"):

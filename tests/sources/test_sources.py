@@ -299,9 +299,3 @@ def test_kharkiv_has_177_frames_of_the_containers_times(footage):
     assert chosen.tolist() == list(range(0, 177, 5))
     read = list(iter_frames(path, info, chosen[:3]))
     assert [FrameFlag(frame.flags) for frame in read] == [FrameFlag(0)] * 3
-
-
-@pytest.mark.footage
-def test_kit_ais_folder_is_read_in_natural_order(footage):
-    info = probe(footage("kit_ais") / "MOS74_crossroad", frames=FramesConfig(fps=2))
-    assert (info.frame_count, info.names[0], info.names[-1]) == (20, "MOS74.png", "MOS93.png")

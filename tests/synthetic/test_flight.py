@@ -12,7 +12,7 @@ import pytest
 from schemas.simulation import CameraSimulation, SimulationConfig, TrafficSimulation
 from velfield.errors import InputError
 from velfield.synthetic.cases import FLAT, small_flight
-from velfield.synthetic.score import fit_homography, score_field, score_registration
+from velfield.synthetic.score import score_field
 from velfield.synthetic.truth import CAR_COLUMNS, LanePath, Truth, load_truth, make_truth
 from velfield.synthetic.write import write_flight
 
@@ -128,29 +128,6 @@ def test_cars_of_the_truth_agree_with_its_transform(truth: Truth) -> None:
     cars = truth.cars[(truth.cars["frame"] == 7) & truth.cars["visible"]]
     raw, base = cars[["x_raw_px", "y_raw_px"]].to_numpy(), cars[["x_base_px", "y_base_px"]].to_numpy()
     assert np.abs(truth.to_base(7, raw) - base).max() < 0.02
-
-
-def test_velocities_of_the_truth_agree_with_its_positions(truth: Truth) -> None:
-    steps = truth.segments()
-    cars = truth.cars.set_index(["frame", "vehicle_id"])
-    before = cars.loc[pd.MultiIndex.from_frame(steps[["frame", "vehicle_id"]])]
-    error = np.hypot(
-        steps["vx_px_per_s"].to_numpy() - before["vx_px_per_s"].to_numpy(),
-        steps["vy_px_per_s"].to_numpy() - before["vy_px_per_s"].to_numpy(),
-    )
-    assert len(steps) > 50
-    assert np.median(error) < 2.0
-
-
-def test_a_run_on_another_grid_is_scored_after_a_fitted_homography(truth: Truth) -> None:
-    other_grid = np.array([[0.9, -0.2, 40.0], [0.2, 0.9, -15.0], [1e-5, 0, 1.0]])
-
-    def run(frame: int, xy: np.ndarray) -> np.ndarray:
-        return cv2.perspectiveTransform(truth.to_base(frame, xy)[None], other_grid)[0]
-
-    matrix = fit_homography(truth, run, range(12))
-    assert score_registration(truth, run, range(12)).mean_px > 10
-    assert score_registration(truth, run, range(12), to_truth=matrix).mean_px < 1e-3
 
 
 def test_a_field_along_the_lanes_scores_perfectly_and_one_across_does_not(truth: Truth) -> None:

@@ -17,7 +17,6 @@ from velfield.synthetic.score import (
     _true_triples,
     apply_homography,
     fit_homography,
-    sample_grid,
     score_detections,
     score_field,
     score_registration,
@@ -60,12 +59,6 @@ def truth(cars: list[dict[str, object]], lanes: list[LanePath] | None = None, fr
 
 def detections(*rows: tuple[int, float, float, float]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["frame", "x_px", "y_px", "orientation_rad"])
-
-
-def test_the_constructed_camera_is_the_identity() -> None:
-    xy = sample_grid(truth([car(0, 0, 50, 50)]))
-    assert xy.shape == (24 * 18, 2)
-    assert truth([car(0, 0, 50, 50)]).to_base(2, xy) == pytest.approx(xy)
 
 
 def test_precision_and_recall_of_detections_are_counts() -> None:

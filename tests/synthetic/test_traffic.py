@@ -113,12 +113,3 @@ def test_speeds_are_those_of_a_city() -> None:
     assert traffic.speed_m_per_s.max() * 3.6 < 70
     for a, b in zip(traffic.first, traffic.first[1:], strict=False):
         assert (np.diff(traffic.distance_m[a:b]) >= -1e-9).all()
-
-
-def test_same_seed_same_traffic() -> None:
-    _, first = city(0)
-    rng = np.random.default_rng(0)
-    plan = make_city_plan(CITY_M, rng, turn_share=CONFIG.turn_share, cycle_s=CONFIG.cycle_s)
-    again = simulate_traffic(plan.road_network, CONFIG, duration_s=120.0, rng=rng)
-    assert np.array_equal(first.distance_m, again.distance_m)
-    assert np.array_equal(first.dimensions.length_m, again.dimensions.length_m)

@@ -1,27 +1,12 @@
 """Sub-pixel displacement: the car's, not the background's, with a calibrated standard deviation."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from schemas.arrays import ByteArray, FloatArray
 from tests.tracking_scenes import CROP_PX, Car, Detector, appearance, car, crops_of, draw, road, watch
 from velfield.tracking import crop_alignment
 from velfield.tracking.crop_alignment import (
-    BLUR_SIGMA_PX,
-    CAR_LENGTH_PX,
-    CAR_WIDTH_PX,
-    CONVERGENCE_PX,
-    MAX_DISAGREEMENT_PX,
-    MAX_ITERATIONS,
-    MAX_SHIFT_PX,
-    MIN_PIXELS,
-    MIN_SD_PX,
-    REWEIGHTING_ITERATIONS,
-    TAPER_PX,
-    TUKEY_C,
     align_prepared,
     prepare_crops,
 )
@@ -49,109 +34,8 @@ def moved_cars(n: int, *, noise: float = 3.0, jitter: float = 0.8):
     return np.array(before), np.array(after), np.array(axes) % np.pi, np.array(shifts)
 
 
-def align_plainly(before: ByteArray, after: ByteArray, axis: float) -> tuple[float, float, float]:
-    """One pair by array expressions: shift x, shift y, standard deviation; NaN where it does not align."""
-    taps = np.exp(-0.5 * (np.arange(-2, 3) / BLUR_SIGMA_PX) ** 2)
-    taps /= taps.sum()
-    rim = MAX_SHIFT_PX + 2
-
-    def blur(crop: NDArray[Any]) -> NDArray[Any]:
-        for _ in range(2):
-            wide = np.pad(crop.astype(float), ((2, 2), (0, 0)), mode="edge")
-            crop = np.sum([tap * wide[k : k + len(crop)] for k, tap in enumerate(taps)], axis=0).T
-        return np.pad(crop, rim)
-
-    y, x = np.mgrid[: CROP_PX + 2 * rim, : CROP_PX + 2 * rim] - CROP_PX // 2 - rim
-    along, across = abs(x * np.cos(axis) + y * np.sin(axis)), abs(y * np.cos(axis) - x * np.sin(axis))
-    beyond = np.maximum(along - CAR_LENGTH_PX / 2, across - CAR_WIDTH_PX / 2)
-    weight = np.clip(1 - beyond / TAPER_PX, 0, 1)
-    rows, columns = np.nonzero(weight)
-
-    def cubic(t: float) -> tuple[float, ...]:
-        return (
-            ((-t + 2) * t - 1) * t / 2,
-            (3 * t - 5) * t * t / 2 + 1,
-            ((-3 * t + 4) * t + 1) * t / 2,
-            (t - 1) * t * t / 2,
-        )
-
-    def lucas_kanade(template: FloatArray, image: FloatArray, u: float, v: float) -> tuple[float, float, float]:
-        gradient = np.stack([np.gradient(template, axis=k)[rows, columns] for k in (1, 0)], axis=1)
-        for count in range(MAX_ITERATIONS):
-            if count < REWEIGHTING_ITERATIONS:
-                near = round(v), round(u)
-            iy, ix = int(np.floor(v)), int(np.floor(u))
-            value = np.sum(
-                [
-                    a * b * image[rows + iy - 1 + j, columns + ix - 1 + k]
-                    for j, a in enumerate(cubic(v - iy))
-                    for k, b in enumerate(cubic(u - ix))
-                ],
-                axis=0,
-            )
-            w = np.minimum(weight[rows, columns], weight[rows + near[0], columns + near[1]])
-            d, g, w = (value - template[rows, columns])[w > 0], gradient[w > 0], w[w > 0]
-            if len(d) < MIN_PIXELS:
-                break
-            d = d - np.median(d)
-            spread = 1.4826 * np.median(abs(d)) + 1
-            w = w * np.clip(1 - (d / (TUKEY_C * spread)) ** 2, 0, None) ** 2
-            g, d = g - np.average(g, axis=0, weights=w), d - np.average(d, weights=w)
-            normal = (w * g.T) @ g
-            step = -np.linalg.solve(normal, (w * g.T) @ d)
-            variance = (w * d) @ d / w.sum() * np.trace(normal) / 2 / np.linalg.det(normal)
-            u, v = (u, v) + step / max(np.hypot(*step), 1)
-            if np.hypot(*step) < CONVERGENCE_PX:
-                return u, v, variance
-        return np.nan, np.nan, np.nan
-
-    a, b = blur(before), blur(after)
-    best, u, v = np.inf, 0, 0
-    squares = (np.mgrid[-MAX_SHIFT_PX : MAX_SHIFT_PX + 1, -MAX_SHIFT_PX : MAX_SHIFT_PX + 1] ** 2).sum(axis=0)
-    for square in range(2 * MAX_SHIFT_PX**2 + 1):
-        if square == 11 and u * u + v * v <= 5:
-            break
-        for dy, dx in np.argwhere(squares == square) - MAX_SHIFT_PX:
-            y, x = rows[::2], columns[::2]
-            w = np.minimum(weight[y, x], weight[y + dy, x + dx])
-            difference = (w * abs(b[y + dy, x + dx] - a[y, x])).sum() / max(w.sum(), 1e-9)
-            if w.sum() > weight[rows[::2], columns[::2]].sum() / 4 and difference < best:
-                best, u, v = difference, dx, dy
-    fx, fy, forward = lucas_kanade(a, b, float(u), float(v))
-    if np.isnan(fx):
-        bx, by, backward = lucas_kanade(b, a, -float(u), -float(v))
-        if np.isnan(bx):
-            return bx, bx, bx
-        fx, fy, forward = lucas_kanade(a, b, -bx, -by)
-    else:
-        bx, by, backward = lucas_kanade(b, a, -fx, -fy)
-    apart = np.hypot(fx + bx, fy + by)
-    if not apart <= MAX_DISAGREEMENT_PX:
-        return np.nan, np.nan, np.nan
-    noise = 2 * np.pi * BLUR_SIGMA_PX**2 * (forward + backward)
-    return (fx - bx) / 2, (fy - by) / 2, np.sqrt(noise + (apart / 2) ** 2 + MIN_SD_PX**2)
-
-
 def align_crops(before, after, axis_before, axis_after, first, second):
     return align_prepared(prepare_crops(before, axis_before), prepare_crops(after, axis_after), first, second)
-
-
-def test_the_compiled_alignment_equals_array_expressions() -> None:
-    before, after, axes, _ = moved_cars(30)
-    index = np.arange(30)
-    found = align_crops(before, after, axes, axes, index, index)
-    plain = np.array([align_plainly(*pair) for pair in zip(before, after, axes, strict=True)])
-    assert np.isfinite(found[:, 2]).sum() >= 28
-    assert np.array_equal(np.isnan(found), np.isnan(plain))
-    assert np.nanmax(abs(found - plain)) < 0.02
-
-
-def test_crops_prepared_with_others_align_the_same() -> None:
-    before, after, axes, _ = moved_cars(6)
-    some = np.array([4, 1])
-    together = align_prepared(prepare_crops(before, axes), prepare_crops(after, axes), some, some)
-    alone = align_crops(before[some], after[some], axes[some], axes[some], np.arange(2), np.arange(2))
-    assert np.array_equal(together, alone, equal_nan=True)
 
 
 def test_alignment_is_ten_times_more_accurate_than_the_detections() -> None:

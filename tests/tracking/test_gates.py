@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from schemas.flight import TrackingConfig
-from velfield.tracking.gates import DetectionStates, GateLog, Limits, gate_link_pairs, gate_links, triples_pass
+from velfield.tracking.gates import DetectionStates, Limits, gate_link_pairs, gate_links, triples_pass
 
 PAPER = Limits.from_config(TrackingConfig(), None)
 
@@ -20,10 +18,6 @@ def test_without_ground_sample_distance_the_limits_are_the_papers_in_pixels() ->
     assert PAPER.max_speed_px_per_s == pytest.approx(150)
     assert PAPER.stationary_speed_px_per_s == pytest.approx(5)
     assert PAPER.max_acceleration_px_per_s2 == pytest.approx(100)
-
-
-def test_with_it_they_are_the_same_in_metres() -> None:
-    assert Limits.from_config(TrackingConfig(), 0.426).max_speed_px_per_s == pytest.approx(34.5 / 0.426)
 
 
 @pytest.mark.parametrize(("interval_s", "limit_px"), [(0.04, 6.0), (0.2, 30.0), (0.4, 60.0)])
@@ -89,16 +83,6 @@ def test_jitter_rejects_few_true_tracklets_at_any_frame_rate(interval_s: float) 
         before, after = gate_links(p[0], p[1], PAPER), gate_links(p[1], p[2], PAPER)
         kept += gate_link_pairs((p[0], p[1], p[2]), before, after, PAPER).link_01.size
     assert kept >= 0.97 * 400
-
-
-@given(st.lists(st.tuples(st.sampled_from(["speed", "axis", "turn"]), st.integers(0, 9))), st.integers(0, 5))
-def test_gate_logs_add(entries: list[tuple[str, int]], cut: int) -> None:
-    """Log of a part + log of the rest == log of all."""
-    parts = [GateLog(), GateLog(), GateLog()]
-    for i, (gate, count) in enumerate(entries):
-        parts[2].add(gate, count)
-        parts[i >= cut].add(gate, count)
-    assert dict(parts[0] + parts[1]) == dict(parts[2])
 
 
 def test_triples_that_are_chosen_otherwise_pass_the_gates_one_by_one() -> None:

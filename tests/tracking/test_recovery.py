@@ -10,9 +10,6 @@ from tests.tracking_scenes import together
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import EndContext
 from velfield.tracking.recovery import (
-    _FILL_M,
-    _FILL_M_PER_S,
-    _MAX_FILL_M,
     Candidates,
     Gap,
     extend_tracks,
@@ -89,26 +86,6 @@ def test_a_gap_is_filled_on_the_way_and_goes_through_what_fills_it() -> None:
     assert free.tolist() == [False, True, True, False, True]
     through = interpolate_gap(replace(gap, filled=rows), seen, np.array([2.6, 3.0, 3.4]))
     assert through == pytest.approx(np.array([[4.8, 0.3], [8.0, -0.05], [11.2, -0.4]]))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_no_candidate_on_the_way_is_left_out_where_only_near_ones_are_measured(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    frames = np.arange(1, 40)
-    for _ in range(40):
-        place, velocity = rng.uniform(-40, 40, (2, 2)), rng.normal(0, 8, (2, 2))
-        gap = Gap(0, (0.0, 40 * DT), (place[0], place[1]), (velocity[0], velocity[1]))
-        at = np.repeat(frames, 3)
-        near = candidates(at, gap.at(at * DT) + rng.normal(0, 1.5, (len(at), 2)))
-        offset = np.hypot(*(near.position_m - gap.at(near.time_s)).T)
-        known = np.minimum(near.time_s, 40 * DT - near.time_s)
-        allowed = np.minimum(_FILL_M + _FILL_M_PER_S * known, _MAX_FILL_M)
-        expected = []
-        for frame in frames:
-            rows = np.flatnonzero((near.frame == frame) & (offset <= allowed))
-            expected += rows[np.argsort(offset[rows], kind="stable")][:1].tolist()
-        assert fill_gap(gap, near, np.ones(len(near), bool)).tolist() == expected
-        assert len(expected) > 5
 
 
 def test_a_vehicle_that_stops_in_a_gap_does_not_overshoot() -> None:
