@@ -26,8 +26,9 @@ hypothesis.settings.load_profile("velfield")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _LONGEST = (
-    *("kills", "accuracy", "serve", "reprocess", "s3", "cluster", "viewer", "flows", "cli", "docs", "training"),
-    *("detection", "intersensor", "direct_registration", "intrasensor", "motion_labels"),
+    *("kills", "accuracy", "serve", "reprocess", "cluster", "s3", "viewer", "flows", "two_term_lens", "intersensor"),
+    *("previews", "bench_speed", "refusals", "nth_call", "quality", "noisy_tracks", "tracks", "direct_registration"),
+    *("detection", "intrasensor"),
 )
 """Files that take a minute or so: begun first, or one process would sit over the last of them while the other waits."""
 

@@ -28,7 +28,7 @@ def test_a_flight_with_base_image_and_labels_is_near_the_truth(server: None, tmp
         labels=str(flight / "labels.csv"),
     )
     settings = [
-        "detection.fine_tune_steps=100",
+        "detection.fine_tune_steps=20",
         "registration.max_keypoints=1500",
     ]
     config = resolve_config(settings=settings, overrides={"gsd_m": 0.23})

@@ -16,6 +16,7 @@ from dask import delayed
 from distributed import Client, LocalCluster
 from distributed.versions import VersionMismatchWarning, get_versions
 
+from flows.launch import prepare_process
 from flows.runners import (
     ClusterFile,
     RunnerConfig,
@@ -69,34 +70,24 @@ def test_a_cluster_file_that_is_none_is_refused(tmp_path: Path, text: str) -> No
         read_runner(tmp_path / "cluster.yaml")
 
 
-def test_workers_of_our_own_keep_memory_for_pictures() -> None:
-    """Dask's own setting makes a run take half as long again."""
-    from dask import delayed
-
-    from flows.launch import prepare_process
-
-    prepare_process(verbose=False)
-    with open_runner(RunnerConfig(workers=1)) as runner:
-        text = runner.compute(delayed(os.environ.get)("MALLOC_TRIM_THRESHOLD_"))
-    assert int(text) == 256 << 20
-
-
 def stages_not_loaded() -> list[str]:
     modules = {path.partition(":")[0] for stage in STAGES for path in (stage.unit, stage.block) if path is not None}
     return sorted(modules - set(sys.modules))
 
 
-def test_workers_of_our_own_import_what_the_stages_need_before_their_first_task() -> None:
+def test_workers_of_our_own_keep_memory_for_pictures_import_the_stages_first_and_are_restarted() -> None:
+    """With Dask's own setting of memory a run takes half as long again."""
+    prepare_process(verbose=False)
     with open_runner(RunnerConfig(workers=1)) as runner:
-        assert runner.compute(delayed(stages_not_loaded)()) == []
-
-
-def test_workers_of_our_own_are_restarted_and_others_are_left_alone() -> None:
-    with open_runner(RunnerConfig(workers=1)) as runner:
+        assert runner.compute(delayed(stages_not_loaded)()) == []  # before the first task
+        assert runner.call(os.environ.get, "MALLOC_TRIM_THRESHOLD_") == str(256 << 20)
         before = runner.call(os.getpid)
         assert runner.call(os.getpid) == before
         runner.restart_workers()
         assert runner.call(os.getpid) not in (before, os.getpid())
+
+
+def test_workers_of_others_are_not_restarted() -> None:
     with (
         LocalCluster(n_workers=1, dashboard_address="127.0.0.1:0", host="127.0.0.1") as cluster,
         open_runner(RunnerConfig(scheduler=cluster.scheduler_address)) as runner,

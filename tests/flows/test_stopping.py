@@ -43,7 +43,8 @@ def test_what_a_process_started_ends_with_it(kill: bool) -> None:
 
 
 def test_ctrl_c_is_answered(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "flows.cli", "simulate", str(tmp_path / "flight"), "--frames", "500"]
+    flight = str(tmp_path / "flight")
+    command = [sys.executable, "-m", "flows.cli", "simulate", flight, "--frames", "500", "--size", "640x480"]
     checkout = str(Path(__file__).parents[2])
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": checkout}, text=True

@@ -60,15 +60,6 @@ def write(form: str, path: Path) -> tuple[Path, dict[str, float | str]]:
             table, said = plain.assign(x_px=t["x_px"], y_px=t["y_px"]), {"gsd_m": GSD_M}
             table.to_csv(path.with_suffix(".csv"), index=False)
             return path.with_suffix(".csv"), said
-        case "geotrax":
-            table = pd.DataFrame({"Vehicle_ID": t["vehicle_id"], "Timestamp": t["time_s"], "Frame_Number": t["frame"]})
-            table = table.assign(Ortho_X=t["x_px"], Ortho_Y=t["y_px"], Local_X=t["x_m"], Local_Y=-t["y_m"])
-            table = table.assign(Vehicle_Length=t["length_m"], Vehicle_Width=1.8)
-        case "highd":
-            table = pd.DataFrame({"frame": t["frame"] + 1, "id": t["vehicle_id"], "time": t["time_s"]})
-            table = table.assign(
-                x=t["x_m"] - 2.0, y=t["y_m"] - 1.0, width=4.0, height=2.0, xVelocity=0.0, yVelocity=0.0
-            )
         case _:
             steps = "".join(
                 f'<timestep time="{time:.4f}">'
@@ -174,7 +165,7 @@ def test_the_flow_writes_the_same_bits_and_repairs_what_was_damaged(run: Run, se
         verify(root, repair=True)
 
 
-@pytest.mark.parametrize("form", ["pixels", "geotrax", "highd", "fcd"])
+@pytest.mark.parametrize("form", ["pixels", "fcd"])
 def test_each_format_gives_the_same_answers(form: str, run: Run, tmp_path: Path) -> None:
     path, said = write(form, tmp_path / "t")
     other = process(path, tmp_path / "run", **({"gsd_m": GSD_M} | said))

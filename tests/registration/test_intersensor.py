@@ -177,11 +177,10 @@ def town(seed: int, block_px: int = 110) -> np.ndarray:
     return np.clip(noisy, 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_another_town_of_the_same_blocks_is_refused(seed: int) -> None:
+def test_another_town_of_the_same_blocks_is_refused() -> None:
     """Its streets match in 45 to 50 % of the patches, more than the fourth that a map needs whose place is known."""
-    image = town(seed)[100:820, 100:1060]
-    assert isinstance(register_intersensor(image, town(seed), CONFIG, lens=pinhole(image.shape)), IntersensorResult)
-    refused = register_intersensor(image, town(seed + 1), CONFIG, lens=pinhole(image.shape))
+    image = town(0)[100:820, 100:1060]
+    assert isinstance(register_intersensor(image, town(0), CONFIG, lens=pinhole(image.shape)), IntersensorResult)
+    refused = register_intersensor(image, town(1), CONFIG, lens=pinhole(image.shape))
     assert isinstance(refused, Failure)
     assert "not an image of this flight's area" in refused.reason
