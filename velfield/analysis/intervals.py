@@ -20,7 +20,7 @@ MIN_VEHICLES = 5
 """Fewer vehicles give no estimate."""
 _ALIKE_S = 5.0
 """Time between two vehicles in which the correlation of their speeds and delays falls to 1/e."""
-_ALIKE, _ALIKE_PAIRS = 0.7, 3.0
+_ALIKE, _ALIKE_PAIRS = 0.7, 15.0
 """Correlation of vehicles that pass at once before any is seen, and the number of pairs that it counts for."""
 
 
@@ -49,7 +49,7 @@ def independent_vehicles(values: FloatArray, time_s: FloatArray) -> float:
     >>> round(independent_vehicles(np.array([1.0, 2.0, 2.0, 1.0]), 100.0 * np.arange(4)), 1)
     4.0
     >>> round(independent_vehicles(np.array([1.0, 1.1, 2.0, 2.1]), np.array([0.0, 1.0, 50.0, 51.0])), 1)
-    2.3
+    2.5
     """
     order = np.argsort(time_s, kind="stable")
     x, n = values[order] - values.mean(), len(values)
