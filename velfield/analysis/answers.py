@@ -319,18 +319,18 @@ def lanes_text(lanes: Sequence[int]) -> str:
 
 
 def queue_text(queue: Queue) -> str:
-    """Vehicles of a queue, with their interval, and its length; of one that goes on out of view lower bounds.
+    """Vehicles of a queue, with their interval, and its length; of one whose end is not seen lower bounds.
 
     Examples
     --------
     >>> queue_text(Queue(12.0, Estimate(4, 3, 6, 3), 23.4))
     '4 vehicles (3 to 6), 23 m'
     >>> queue_text(Queue(12.0, Estimate(14, 14, 14, 14), 92.0, reaches_edge=True))
-    'at least 14 vehicles, 92 m: it ends out of view'
+    'at least 14 vehicles over 92 m: where it ends is not seen'
     """
     n = queue.vehicles
     if queue.reaches_edge:
-        return f"at least {count_text(round(n.low), 'vehicle')}, {queue.length_m:.0f} m: it ends out of view"
+        return f"at least {count_text(round(n.low), 'vehicle')} over {queue.length_m:.0f} m: where it ends is not seen"
     ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
     return f"{count_text(round(n.value), 'vehicle')}{ends}, {queue.length_m:.0f} m"
 
