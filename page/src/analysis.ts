@@ -11,6 +11,12 @@ export interface Geometry {
   xy_px: [number, number][];
 }
 
+/** A row of a table on the map; its label is empty where nothing in the row names it alone. */
+export interface Place {
+  geometry: Geometry;
+  label: string;
+}
+
 interface Estimate {
   value: number | null;
   low: number | null;
@@ -57,7 +63,7 @@ export class AnalysisPanel {
   constructor(
     private readonly units: Units,
     /** Show these on the map, one of them chosen. */
-    private readonly draw: (all: Geometry[], chosen: Geometry | null) => void,
+    private readonly draw: (all: Place[], chosen: Geometry | null) => void,
   ) {}
 
   /** Fill the panel; read the file the first time. */
@@ -103,7 +109,7 @@ export class AnalysisPanel {
     content.push(table.rows.length ? this.rows(table) : make("p", {}, "Nothing of this kind was found."));
     if (table.rows.length > MAX_ROWS) content.push(make("p", { class: "note" }, `and ${table.rows.length - MAX_ROWS} more, in analysis/analysis.json`));
     find("analysis-content").replaceChildren(...content);
-    this.draw(geometries(table), null);
+    this.draw(places(table), null);
   }
 
   private rows(table: Table): HTMLElement {
@@ -125,7 +131,7 @@ export class AnalysisPanel {
     const { geometry } = row;
     if (!geometry) return "";
     const button = make("button", { type: "button", "aria-label": `Show row ${k + 1} on the map`, class: "place" }, "●");
-    button.addEventListener("click", () => this.draw(geometries(table), geometry));
+    button.addEventListener("click", () => this.draw(places(table), geometry));
     return button;
   }
 
@@ -151,6 +157,9 @@ export class AnalysisPanel {
   }
 }
 
-function geometries(table: Table): Geometry[] {
-  return table.rows.flatMap(({ geometry }) => (geometry ? [geometry] : []));
+/** The rows of a table that lie on the map, with their first cells as labels where no two rows share one. */
+function places(table: Table): Place[] {
+  const labels = table.rows.map(({ cells }) => cells[table.columns[0]!.name] ?? "");
+  const named = new Set(labels).size === labels.length && labels.every((label) => typeof label !== "object");
+  return table.rows.flatMap(({ geometry }, k) => (geometry ? [{ geometry, label: named ? String(labels[k]) : "" }] : []));
 }

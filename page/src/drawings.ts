@@ -1,8 +1,9 @@
 // Drawings on the map over its layers: the selected pixel, the line, tracks.
 
 import L from "leaflet";
-import type { Geometry } from "./analysis";
+import type { Geometry, Place } from "./analysis";
 import { toLatLng, toPoint, type Point } from "./coordinates";
+import { make } from "./dom";
 import type { Near, TrackIndex } from "./tracks";
 
 const MAX_TRACKS = 60;
@@ -49,11 +50,12 @@ export class Drawings {
     }
   }
 
-  /** The places of a table's rows, the chosen one in white; the map moves to it. */
-  showGeometries(all: Geometry[], chosen: Geometry | null): void {
+  /** The places of a table's rows with their labels, and arrows on lines; the chosen one in white; the map moves to it. */
+  showPlaces(all: Place[], chosen: Geometry | null): void {
     this.places.clearLayers();
-    for (const geometry of all) this.addGeometry(geometry, "#000", 4);
-    for (const geometry of all) this.addGeometry(geometry, "#5ee0ff", 2);
+    for (const { geometry } of all) this.addGeometry(geometry, "#000", 4);
+    for (const { geometry } of all) this.addGeometry(geometry, "#5ee0ff", 2);
+    for (const place of all) this.addLabel(place);
     if (!chosen) return;
     this.addGeometry(chosen, "#000", 9);
     this.addGeometry(chosen, "#fff", 5);
@@ -69,6 +71,21 @@ export class Drawings {
     else this.places.addLayer(L.polyline(points, options));
   }
 
+  private addLabel({ geometry: { type, xy_px }, label }: Place): void {
+    const middle = type === "LineString" ? Math.floor(xy_px.length / 2) : 0;
+    const [x, y] = type === "Polygon" ? centre(xy_px) : xy_px[middle]!;
+    const content = make("span", { class: "place-label" }, label);
+    if (type === "LineString" && middle) {
+      const [fromX, fromY] = xy_px[middle - 1]!;
+      const arrow = make("span", { class: "place-arrow" }, "➤");
+      arrow.style.transform = `rotate(${Math.atan2(y - fromY, x - fromX)}rad)`;
+      content.prepend(arrow);
+    }
+    if (!content.textContent) return;
+    const icon = L.divIcon({ className: "", html: content, iconSize: [0, 0] });
+    this.places.addLayer(L.marker(toLatLng(x, y), { icon, interactive: false, keyboard: false }));
+  }
+
   showTracks(near: Near[], index: TrackIndex | null): void {
     this.tracks.clearLayers();
     if (!index) return;
@@ -81,4 +98,8 @@ export class Drawings {
       this.tracks.addLayer(L.circleMarker(end, { ...options, radius: 3, color: "#000", weight: 1, fillColor: "#fff", fillOpacity: 1 }));
     }
   }
+}
+
+function centre(xy: [number, number][]): [number, number] {
+  return [0, 1].map((axis) => xy.reduce((sum, point) => sum + point[axis as 0 | 1], 0) / xy.length) as [number, number];
 }

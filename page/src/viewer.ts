@@ -56,7 +56,7 @@ class Viewer {
     this.flow = new Flow(run);
     this.replay = new Replay(run, this.speedMax(), (ended) => this.replayed(ended), (error) => this.fail(error));
     this.player = new Player(this.replay, () => this.animation.request(), () => this.keepTime());
-    this.analysis = new AnalysisPanel(this.units, (all, chosen) => this.drawings.showGeometries(all, chosen));
+    this.analysis = new AnalysisPanel(this.units, (all, chosen) => this.drawings.showPlaces(all, chosen));
     this.fillControls();
     this.applyView();
     this.listen();
@@ -430,7 +430,7 @@ class Viewer {
     this.animation.show(moving);
     this.player.show(moving && this.state.replay !== null);
     if (tab === "analysis") this.analysis.show().catch((error) => this.failAnalysis(error));
-    else this.drawings.showGeometries([], null);
+    else this.drawings.showPlaces([], null);
   }
 
   private failAnalysis(error: unknown): void {

@@ -395,6 +395,8 @@ def test_the_tab_of_the_analysis_shows_tables_with_n_and_intervals(chromium: Bro
         assert cells == ["●", "0", "36 32.4 to 41.4, n = 14", "", "1", "–"]
         titles = page.value("[...document.querySelectorAll('#analysis thead th')].map((cell) => cell.textContent)")
         assert titles == ["Map", "Lane", "Median speed, km/h"]
+        labels = page.value("[...document.querySelectorAll('#map .place-label')].map((each) => each.textContent)")
+        assert labels == ["➤0"]  # the second row has no place
         page.value("document.querySelector('#analysis .place').click()")
         assert page.value("document.getElementById('side').hidden")
         assert page.complaints == []
