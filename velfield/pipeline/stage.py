@@ -168,7 +168,7 @@ STAGES: tuple[Stage, ...] = (
     # Spread frames registered to the sharpest, and their median; or the registration of a given image.
     Stage(
         name="base",
-        version=20,
+        version=21,
         label="base image",
         lines=(
             Line(
@@ -188,7 +188,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=18,
+        version=19,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),

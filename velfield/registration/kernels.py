@@ -35,39 +35,6 @@ def rational(points: FloatArray, coefficients: FloatArray, source: FloatArray, t
     return out
 
 
-@compiled(error_model="numpy")
-def rational_jacobian(
-    points: FloatArray, coefficients: FloatArray, source: FloatArray, target: FloatArray
-) -> FloatArray:
-    """Jacobian (n, 2, 2) of `rational`: [i, a, b] is d out_a / d in_b."""
-    out = np.empty((points.shape[0], 2, 2))
-    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = coefficients
-    source_x, source_y, scale = source[0], source[1], source[2] / target[2]
-    for i in range(points.shape[0]):
-        x, y = (points[i, 0] - source_x) * source[2], (points[i, 1] - source_y) * source[2]
-        w = c0 + c1 * x + c2 * y + c3 * x * x + c4 * x * y + c5 * y * y
-        w = w if w > 1e-9 else np.nan
-        p = (a0 + a1 * x + a2 * y + a3 * x * x + a4 * x * y + a5 * y * y) / w
-        q = (b0 + b1 * x + b2 * y + b3 * x * x + b4 * x * y + b5 * y * y) / w
-        w_x, w_y = c1 + 2 * c3 * x + c4 * y, c2 + c4 * x + 2 * c5 * y
-        out[i, 0, 0] = (a1 + 2 * a3 * x + a4 * y - p * w_x) / w * scale
-        out[i, 0, 1] = (a2 + a4 * x + 2 * a5 * y - p * w_y) / w * scale
-        out[i, 1, 0] = (b1 + 2 * b3 * x + b4 * y - q * w_x) / w * scale
-        out[i, 1, 1] = (b2 + b4 * x + 2 * b5 * y - q * w_y) / w * scale
-    return out
-
-
-@compiled(error_model="numpy")
-def solve(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """Solve 2 x 2 systems (n, 2, 2) for residuals (n, 2) by Cramer's rule; not finite where one is singular."""
-    out = np.empty((len(residual), 2))
-    for i in range(len(residual)):
-        (a, b), (c, d) = (jacobian[i, 0, 0], jacobian[i, 0, 1]), (jacobian[i, 1, 0], jacobian[i, 1, 1])
-        determinant, x, y = a * d - b * c, residual[i, 0], residual[i, 1]
-        out[i, 0], out[i, 1] = (d * x - b * y) / determinant, (a * y - c * x) / determinant
-    return out
-
-
 @kernel
 def spline_basis(rows: FloatArray, height: int, knots: int) -> tuple[IntArray, FloatArray]:
     """Uniform cubic B-spline basis at rows (n,): index of the first of four coefficients (n,), their weights (n, 4).

@@ -104,11 +104,11 @@ class PolyprojectiveTransform:
 
     def jacobian(self, xy: FloatArray) -> FloatArray:
         """Jacobian (n, 2, 2) at points (n, 2)."""
-        return np.asarray(kernels.rational_jacobian(as_points(xy), self.coefficients, self.source, self.target))
+        return _differentiate(self, xy)
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back by Newton's method from the homography's inverse; NaN rows where it fails."""
-        return _invert(xy, self.homography_inverse(xy), self, lambda points, _: self.jacobian(points))
+        return _invert(xy, self.homography_inverse(xy), self)
 
     def homography_inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back by the first-order terms alone."""
@@ -119,14 +119,16 @@ class PolyprojectiveTransform:
         return HomographyTransform(self.homography())
 
 
-def _invert(
-    xy: FloatArray,
-    guess: FloatArray,
-    forward: Callable[[FloatArray], FloatArray],
-    jacobian: Callable[[FloatArray, FloatArray], FloatArray],
-) -> FloatArray:
+def _differentiate(forward: Callable[[FloatArray], FloatArray], xy: FloatArray) -> FloatArray:
+    """Jacobian (n, 2, 2) of a map at points (n, 2), by central differences."""
+    points, steps = as_points(xy), _DIFFERENCE_PX * np.eye(2)
+    columns = [(forward(points + step) - forward(points - step)) / (2 * _DIFFERENCE_PX) for step in steps]
+    return np.stack(columns, axis=2)
+
+
+def _invert(xy: FloatArray, guess: FloatArray, forward: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """Inverse of a map at points (n, 2) by Newton's method from ``guess``, each until it is accurate; NaN where that
-    fails. ``jacobian`` (n, 2, 2) of points and what they are mapped to."""
+    fails."""
     points, found, error = as_points(xy), guess.copy(), np.full(len(guess), np.nan)
     todo = np.flatnonzero(np.isfinite(found).all(axis=1))
     for step in range(_INVERSE_STEPS + 1):
@@ -139,7 +141,10 @@ def _invert(
             break
         if len(far) < len(todo):
             todo, here, mapped, residual = todo[far], here[far], mapped[far], residual[far]
-        found[todo] = here + kernels.solve(jacobian(here, mapped), residual)
+        (a, c), (b, d) = ((forward(here + step) - mapped).T / _DIFFERENCE_PX for step in _DIFFERENCE_PX * np.eye(2))
+        x, y = residual.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found[todo] = here + np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
     found[~(error < _MAX_ERROR_PX)] = np.nan
     return found
 
@@ -242,12 +247,7 @@ class FrameTransform:
         NaN rows where there is no inverse, or where it lies outside the frame by more than a tenth of its size and
         more than 64 px.
         """
-
-        def jacobian(raw: FloatArray, mapped: FloatArray) -> FloatArray:
-            steps = _DIFFERENCE_PX * np.eye(2)
-            return np.stack([(self.to_base(raw + step) - mapped) / _DIFFERENCE_PX for step in steps], axis=2)
-
-        raw = _invert(xy_base, self.to_raw_roughly(xy_base), self.to_base, jacobian)
+        raw = _invert(xy_base, self.to_raw_roughly(xy_base), self.to_base)
         margin = max(_OUTSIDE_PX, _OUTSIDE_FRACTION * max(self.width, self.height))
         x, y = raw.T
         raw[~((np.minimum(x, y) >= -margin) & (x <= self.width + margin) & (y <= self.height + margin))] = np.nan
@@ -264,14 +264,8 @@ class FrameTransform:
         return as_points(self.lens.distort_points(self.polyprojective.inverse(as_points(xy_base))))
 
     def jacobian(self, xy_raw: FloatArray) -> FloatArray:
-        """Jacobian (n, 2, 2) of `to_base` at raw pixels (n, 2), by central differences."""
-        raw = as_points(xy_raw)
-        columns = []
-        for axis in range(2):
-            step = np.zeros(2)
-            step[axis] = _DIFFERENCE_PX
-            columns.append((self.to_base(raw + step) - self.to_base(raw - step)) / (2 * _DIFFERENCE_PX))
-        return np.stack(columns, axis=2)
+        """Jacobian (n, 2, 2) of `to_base` at raw pixels (n, 2)."""
+        return _differentiate(self.to_base, xy_raw)
 
     def scale_and_rotation(self) -> tuple[float, float]:
         """Scale, base px per frame px, and rotation from +x to +y, rad, of the nearest similarity at the centre."""
@@ -346,15 +340,11 @@ class MeshedTransform:
 
     def jacobian(self, xy: FloatArray) -> FloatArray:
         """Jacobian (n, 2, 2) at points (n, 2)."""
-        points, columns = as_points(xy), []
-        for step in np.eye(2):
-            columns.append((self(points + step) - self(points - step)) / 2.0)
-        return np.stack(columns, axis=2)
+        return _differentiate(self, xy)
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back; NaN rows where there is no inverse."""
-        p = self.polyprojective  # a mesh bends by far less than a pixel a pixel
-        return _invert(xy, p.inverse(xy), self, lambda points, _: p.jacobian(points))
+        return _invert(xy, self.polyprojective.inverse(xy), self)
 
 
 PlaneTransform = PolyprojectiveTransform | MeshedTransform
