@@ -106,7 +106,8 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
         group_tiles=2,
         velocities_px_per_s=centres,
         attributes={"gsd_m": 0.5, "crs_wkt": "LOCAL_CS[]"},
-        layers={"count": {"dtype": "int32", "units": "1"}, "modal_vx": {"units": "px s-1"}},
+        histograms={HISTOGRAM: {}},
+        layers={"count": ("int32", {"units": "1"}), "modal_vx": ("float32", {"units": "px s-1"})},
     )
     tile = np.arange(4 * 6 * 9, dtype=np.int32).reshape(4, 6, 3, 3)
     store = open_field(path, "r+")
@@ -127,7 +128,7 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
 @pytest.mark.parametrize("group", [(0, 0), (1, 1)], ids=["whole", "at the map's edge"])
 def test_layers_are_read_by_zarr_as_written(tmp_path: Path, group: tuple[int, int]) -> None:
     path = tmp_path / "field.zarr"
-    layers = {"count": {"dtype": "int32", "units": "1"}, "modal_vx": {"units": "px s-1"}}
+    layers = {"count": ("int32", {"units": "1"}), "modal_vx": ("float32", {"units": "px s-1"})}
     create_empty_field(path, side=20, tile=8, bins=3, layers=layers)
     store, (y, x) = open_field(path, "r+"), (16 * group[0], 16 * group[1])
     window = np.s_[y : y + 16, x : x + 16]
@@ -147,7 +148,7 @@ def test_layers_are_read_by_zarr_as_written(tmp_path: Path, group: tuple[int, in
 
 
 def create_empty_field(
-    path: Path, *, side: int, tile: int, bins: int, layers: dict[str, dict[str, str]] | None = None
+    path: Path, *, side: int, tile: int, bins: int, layers: dict[str, tuple[str, dict[str, str]]] | None = None
 ) -> None:
     """A field of a square map, by default without layers."""
     create_field(
@@ -159,6 +160,7 @@ def create_empty_field(
         group_tiles=min(side // tile, 8),
         velocities_px_per_s=np.arange(float(bins)),
         attributes={},
+        histograms={HISTOGRAM: {}},
         layers=layers or {},
     )
 

@@ -5,8 +5,9 @@ read the histogram.
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,68 +18,73 @@ from schemas.flight import FieldConfig
 from schemas.records import GridRecord
 from velfield.field.accumulate import UNIT, VARIANCE_UNIT, FieldTile, Weight
 from velfield.field.segments import VelocityBins, band_radius_px, stationary_speed_px_per_s
-from velfield.field.statistics import tile_statistics
-from velfield.run.stores import GROUP_TILES, HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, create_field
+from velfield.field.statistics import TileStatistics, tile_statistics
+from velfield.run.stores import GROUP_TILES, HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, create_field, fill_value
 
-_SPEED = {"units": "px s-1"}
 
-LAYERS: dict[str, dict[str, Any]] = {
-    "count": {"dtype": "int32", "units": "1", "long_name": "number of vehicle tracks"},
-    "occupancy_ms": {"dtype": "int32", "units": "ms", "long_name": "total time that vehicles spent at the pixel"},
-    "velocity_variance_sum": {
-        "dtype": "int32",
-        "units": "1",
-        "long_name": f"sum over tracks of the variance of a velocity component, in bins squared times {VARIANCE_UNIT}",
-    },
-    "modal_vx": {**_SPEED, "long_name": "x component of the modal velocity"},
-    "modal_vy": {**_SPEED, "long_name": "y component of the modal velocity, down"},
-    "mode_fraction": {"units": "1", "long_name": "fraction of the weight at the mode"},
-    "mean_vx": {**_SPEED, "long_name": "x component of the mean velocity"},
-    "mean_vy": {**_SPEED, "long_name": "y component of the mean velocity, down"},
-    "speed_p15": {**_SPEED, "long_name": "15th percentile of speed"},
-    "speed_p50": {**_SPEED, "long_name": "median speed"},
-    "speed_p85": {**_SPEED, "long_name": "85th percentile of speed"},
-    "stationary_fraction": {"units": "1", "long_name": "fraction of stationary vehicles"},
-    "circular_variance": {"units": "1", "long_name": "circular variance of the direction of moving vehicles"},
-    "entropy": {"units": "1", "long_name": "entropy of the velocity distribution, nats"},
-    "direction_se": {"units": "rad", "long_name": "standard error of the mean direction of moving vehicles"},
-    "speed_se": {**_SPEED, "long_name": "standard error of the median speed"},
-    "direction_ci90_half_width": {
-        "units": "rad",
-        "long_name": "half the width of the 90 % confidence interval of the modal direction",
-    },
-    "speed_p50_ci90_lower": {**_SPEED, "long_name": "lower bound of the 90 % confidence interval of the median speed"},
-    "speed_p50_ci90_upper": {**_SPEED, "long_name": "upper bound of the 90 % confidence interval of the median speed"},
+@dataclass(frozen=True)
+class _Layer:
+    """A layer: units and name of what it holds, its value (ty, tx) of a tile and the tile's statistics, its type."""
+
+    units: str
+    long_name: str
+    value: Callable[[FieldTile, TileStatistics], NDArray[Any]]
+    dtype: str = "float32"
+
+
+_SPEED = "px s-1"
+LAYERS = {
+    "count": _Layer("1", "number of vehicle tracks", lambda t, _: t.count, "int32"),
+    "occupancy_ms": _Layer("ms", "total time that vehicles spent at the pixel", lambda t, _: t.occupancy_ms, "int32"),
+    "velocity_variance_sum": _Layer(
+        "1",
+        f"sum over tracks of the variance of a velocity component, in bins squared times {VARIANCE_UNIT}",
+        lambda t, _: t.variance_sum,
+        "int32",
+    ),
+    "modal_vx": _Layer(_SPEED, "x component of the modal velocity", lambda _, s: s.modal_velocity_px_per_s[..., 0]),
+    "modal_vy": _Layer(
+        _SPEED, "y component of the modal velocity, down", lambda _, s: s.modal_velocity_px_per_s[..., 1]
+    ),
+    "mode_fraction": _Layer("1", "fraction of the weight at the mode", lambda _, s: s.mode_fraction),
+    "mean_vx": _Layer(_SPEED, "x component of the mean velocity", lambda _, s: s.mean_velocity_px_per_s[..., 0]),
+    "mean_vy": _Layer(_SPEED, "y component of the mean velocity, down", lambda _, s: s.mean_velocity_px_per_s[..., 1]),
+    "speed_p15": _Layer(_SPEED, "15th percentile of speed", lambda _, s: s.speed_percentiles_px_per_s[..., 0]),
+    "speed_p50": _Layer(_SPEED, "median speed", lambda _, s: s.speed_percentiles_px_per_s[..., 1]),
+    "speed_p85": _Layer(_SPEED, "85th percentile of speed", lambda _, s: s.speed_percentiles_px_per_s[..., 2]),
+    "stationary_fraction": _Layer("1", "fraction of stationary vehicles", lambda _, s: s.stationary_fraction),
+    "circular_variance": _Layer(
+        "1", "circular variance of the direction of moving vehicles", lambda _, s: s.circular_variance
+    ),
+    "entropy": _Layer("1", "entropy of the velocity distribution, nats", lambda _, s: s.entropy_nats),
+    "direction_se": _Layer(
+        "rad", "standard error of the mean direction of moving vehicles", lambda _, s: s.direction_se_rad
+    ),
+    "speed_se": _Layer(_SPEED, "standard error of the median speed", lambda _, s: s.speed_se_px_per_s),
+    "direction_ci90_half_width": _Layer(
+        "rad",
+        "half the width of the 90 % confidence interval of the modal direction",
+        lambda _, s: s.direction_half_width_rad,
+    ),
+    "speed_p50_ci90_lower": _Layer(
+        _SPEED,
+        "lower bound of the 90 % confidence interval of the median speed",
+        lambda _, s: s.median_speed_low_px_per_s,
+    ),
+    "speed_p50_ci90_upper": _Layer(
+        _SPEED,
+        "upper bound of the 90 % confidence interval of the median speed",
+        lambda _, s: s.median_speed_high_px_per_s,
+    ),
 }
-"""Layer -> attributes in the store; ``dtype`` where it is not float32."""
+"""Layers by their names in the store."""
 
 
 def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dict[str, NDArray[Any]]:
     """All layers of one tile, each (ty, tx)."""
     limit = stationary_speed_px_per_s(config, bins.gsd_m)
-    s = tile_statistics(tile.histogram, tile.count, tile.variance_sum, bins=bins, stationary_speed_px_per_s=limit)
-    values: dict[str, NDArray[Any]] = {
-        "count": tile.count,
-        "occupancy_ms": tile.occupancy_ms,
-        "velocity_variance_sum": tile.variance_sum,
-        "modal_vx": s.modal_velocity_px_per_s[..., 0],
-        "modal_vy": s.modal_velocity_px_per_s[..., 1],
-        "mode_fraction": s.mode_fraction,
-        "mean_vx": s.mean_velocity_px_per_s[..., 0],
-        "mean_vy": s.mean_velocity_px_per_s[..., 1],
-        "speed_p15": s.speed_percentiles_px_per_s[..., 0],
-        "speed_p50": s.speed_percentiles_px_per_s[..., 1],
-        "speed_p85": s.speed_percentiles_px_per_s[..., 2],
-        "stationary_fraction": s.stationary_fraction,
-        "circular_variance": s.circular_variance,
-        "entropy": s.entropy_nats,
-        "direction_se": s.direction_se_rad,
-        "speed_se": s.speed_se_px_per_s,
-        "direction_ci90_half_width": s.direction_half_width_rad,
-        "speed_p50_ci90_lower": s.median_speed_low_px_per_s,
-        "speed_p50_ci90_upper": s.median_speed_high_px_per_s,
-    }
-    return {name: np.asarray(value, LAYERS[name].get("dtype", "float32")) for name, value in values.items()}
+    found = tile_statistics(tile.histogram, tile.count, tile.variance_sum, bins=bins, stationary_speed_px_per_s=limit)
+    return {name: np.asarray(layer.value(tile, found), layer.dtype) for name, layer in LAYERS.items()}
 
 
 Group = tuple[int, int]
@@ -111,8 +117,8 @@ class GroupWriter:
         self._writes: deque[Future[NDArray[np.int32]]] = deque()
         self._zeros: list[NDArray[np.int32]] = []
         self.layers: dict[str, NDArray[Any]] = {
-            name: np.full((self.height, self.width), _fill(attrs), attrs.get("dtype", "float32"))
-            for name, attrs in LAYERS.items()
+            name: np.full((self.height, self.width), fill_value(layer.dtype), layer.dtype)
+            for name, layer in LAYERS.items()
         }
 
     def tiles(self) -> list[tuple[int, int]]:
@@ -182,10 +188,6 @@ class GroupWriter:
         return self.store.files(self.touched, self.group)
 
 
-def _fill(attributes: dict[str, object]) -> float:
-    return np.nan if str(attributes.get("dtype", "float32")).startswith("float") else 0
-
-
 def create_field_store(
     path: Path,
     *,
@@ -233,7 +235,9 @@ def create_field_store(
         velocities_px_per_s=bins.centres_px_per_s,
         attributes={name: value for name, value in attributes.items() if value is not None},
         histograms=_histograms(weighted_by, time_weighted),
-        layers=LAYERS,
+        layers={
+            name: (layer.dtype, {"units": layer.units, "long_name": layer.long_name}) for name, layer in LAYERS.items()
+        },
     )
 
 

@@ -32,8 +32,6 @@ _FORMAT_KEY = "format_version"
 """Attribute of a store that names its format."""
 HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
-HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
-"""Histogram of every field, with its attributes."""
 GROUP_TILES = 8
 """Side of a group in tiles, 512 px: a chunk of the layers."""
 FIELD_BLOCK = 2
@@ -51,6 +49,11 @@ def _create(
     **kw: Any,
 ) -> zarr.Array[Any]:
     return group.create_array(name, shape=tuple(shape), chunks=tuple(chunks), dtype=dtype, compressors=codec, **kw)
+
+
+def fill_value(dtype: str) -> float:
+    """The value of what is not known: NaN, of integers 0."""
+    return np.nan if dtype.startswith("float") else 0
 
 
 def _location(path: Path) -> dict[str, Any]:
@@ -279,8 +282,7 @@ def create_registration(path: Path, *, key: str, count: int, vector_length: int,
     _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
     _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
     for name, dtype in REGISTRATION_COLUMNS.items():
-        fill = np.nan if dtype.startswith("float") else 0
-        _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
+        _create(group, name, (count,), (chunk,), dtype, fill_value=fill_value(dtype), dimension_names=("frame",))
     axes = ("frame", "row", "column")
     for name, cells in zip(_CELL_ARRAYS, (ERROR_CELLS, POSITION_SD_CELLS), strict=True):
         shape, chunks = (count, *cells), (chunk, *cells)
@@ -361,8 +363,8 @@ def create_field(
     group_tiles: int,
     velocities_px_per_s: FloatArray,
     attributes: Mapping[str, Any],
-    histograms: Mapping[str, Mapping[str, Any]] = HISTOGRAMS,
-    layers: Mapping[str, Mapping[str, Any]],
+    histograms: Mapping[str, Mapping[str, Any]],
+    layers: Mapping[str, tuple[str, Mapping[str, Any]]],
 ) -> None:
     """Create ``field.zarr``: the histogram in sparse tiles, whole layers in chunks of one tile group, labelled axes.
 
@@ -372,8 +374,8 @@ def create_field(
         Bin centres of both velocity axes.
     histograms : name -> attributes
         (y, x, vy, vx) histograms; `HISTOGRAM` is one of them.
-    layers : name -> attributes
-        (y, x) layers beside the histogram; ``dtype`` among the attributes is their type, by default float32.
+    layers : name -> type, attributes
+        (y, x) layers beside the histogram.
     """
     group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, **attributes})
     n = len(velocities_px_per_s)
@@ -391,11 +393,11 @@ def create_field(
         )
         histogram.attrs.update({**own_attributes, **grid_mapping})
     side = tile * group_tiles
-    for name, attrs in layers.items():
-        attrs = dict(attrs)
-        dtype = attrs.pop("dtype", "float32")
-        fill: float = np.nan if dtype.startswith("float") else 0
-        layer = _create(group, name, (height, width), (side, side), dtype, fill_value=fill, dimension_names=("y", "x"))
+    for name, (dtype, attrs) in layers.items():
+        layer = _create(
+            group, name, (height, width), (side, side), dtype,
+            fill_value=fill_value(dtype), dimension_names=("y", "x"),
+        )  # fmt: skip
         layer.attrs.update({**attrs, **grid_mapping})
     _write_axes(group, height, width, velocities_px_per_s, attributes)
     group.attrs["key"] = key

@@ -28,6 +28,7 @@ from velfield.run.stores import (
     REGISTRATION_COLUMNS,
     FrameStore,
     create_registration,
+    fill_value,
     is_cut_as,
     open_frames,
     open_registration,
@@ -93,10 +94,7 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
     config = plan.config.registration
     length = vector_length(plan.info.width, plan.info.height, config)
     vectors = np.full((len(frames), length), np.nan)
-    columns = {
-        name: np.full(len(frames), np.nan if dtype.startswith("float") else 0, dtype)
-        for name, dtype in REGISTRATION_COLUMNS.items()
-    }
+    columns = {name: np.full(len(frames), fill_value(dtype), dtype) for name, dtype in REGISTRATION_COLUMNS.items()}
     errors = np.full((len(frames), *ERROR_CELLS), np.nan, np.float32)
     position_sd = np.full((len(frames), *POSITION_SD_CELLS), np.nan, np.float32)
     statuses = []
