@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from schemas.analysis import JunctionKind
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.flow.conflicts import Conflict, find_conflicts
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.flow.speeds import (
@@ -20,6 +20,7 @@ from velfield.analysis.flow.speeds import (
     speed_reduction,
 )
 from velfield.analysis.flow.volume import LaneFlow, lane_flow
+from velfield.analysis.intervals import Estimate
 from velfield.analysis.lanes.find import find_lanes
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import LaneGraph
@@ -40,7 +41,7 @@ from velfield.analysis.signals.cycles import JunctionSignal, ends_out_of_view, f
 from velfield.analysis.signals.queues import Stops, Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
-from velfield.analysis.vehicle_classes import VehicleClasses
+from velfield.analysis.vehicle_classes import HEAVY, VehicleClasses
 
 _THREADS = 2
 """Each needs memory of its own: of 100,000 tracks some GiB."""
@@ -258,6 +259,10 @@ class TrafficAnalysis:
         return find_conflicts(
             self.trajectories, self.lane_traffic, vehicle=self.cut_tracks.vehicle, signalised_m=signalised
         )
+
+    def heavy_share(self, tracks: IntArray) -> Estimate | None:
+        """Share of lorries and buses among the vehicles of some tracks; None where it is not known."""
+        return self.classes.estimate_shares(tracks)[HEAVY] if self.classes else None
 
     @cached_property
     def unusual(self) -> list[Unusual]:

@@ -13,7 +13,6 @@ from schemas.arrays import IntArray
 from schemas.export import ExportOptions
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.vehicle_classes import HEAVY
 from velfield.errors import InputError
 from velfield.run.run import Run
 
@@ -132,5 +131,5 @@ def peak_hour_factor(counts: IntArray) -> float | None:
 
 
 def _heavy_percent(analysis: TrafficAnalysis, tracks: IntArray) -> float | str:
-    share = analysis.classes.estimate_shares(tracks)[HEAVY] if analysis.classes else None
+    share = analysis.heavy_share(tracks)
     return "not known" if share is None else round(100 * share.value, 1)

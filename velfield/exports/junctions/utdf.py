@@ -15,9 +15,7 @@ from schemas.export import ExportOptions
 from velfield.analysis.movements.movements import JunctionMovements, Movement
 from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.vehicle_classes import HEAVY
 from velfield.errors import InputError
-from velfield.exports.georeference import Georeference
 from velfield.run.run import Run
 
 FILE_NAME = "synchro.csv"
@@ -42,10 +40,7 @@ def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     InputError
         The ground sample distance is not known, or no junction with movements was found.
     """
-    georeference = Georeference.from_grid(run.grid)
-    analysis = run.analysis.traffic
-    georeference.to_metres(np.zeros((1, 2)))  # refused without a scale
-    return utdf(analysis, height_m=georeference.shape[0] * analysis.trajectories.gsd_m).encode()
+    return utdf(run.analysis.traffic, height_m=run.grid.height_px * run.gsd_m).encode()
 
 
 def utdf(analysis: TrafficAnalysis, *, height_m: float) -> str:
@@ -142,8 +137,7 @@ class _Node:
         phase = self._phase_of_arm()
 
         def heavy(movements: list[Movement]) -> float | None:
-            tracks = np.concatenate([self.found.tracks(m) for m in movements])
-            share = self.analysis.classes.estimate_shares(tracks)[HEAVY] if self.analysis.classes else None
+            share = self.analysis.heavy_share(np.concatenate([self.found.tracks(m) for m in movements]))
             return round(100 * share.value) if share else None
 
         rows: dict[str, Mapping[str, object]] = {

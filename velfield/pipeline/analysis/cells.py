@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -40,23 +40,43 @@ def estimates(key: str, title: str, unit: str, value: Callable[[T], Estimate | N
 
 
 def make_table(
+    analysis: TrafficAnalysis,
     name: str,
     section: str,
     title: str,
     note: str,
     columns: Sequence[Column[T]],
     items: Iterable[T],
-    place: Callable[[T], GeometryRecord | None],
+    place_m: Callable[[T], FloatArray | None],
+    *,
+    is_area: bool = False,
 ) -> AnalysisTable:
-    """A table with a row for each item, at its place on the map."""
+    """A table with a row for each item.
+
+    ``place_m`` gives its place on the map, m: a point (2,), a line (n, 2) or, with ``is_area``, the corners (n, 2) of
+    an area; None without one.
+    """
+    gsd_m = analysis.trajectories.gsd_m
+
+    def row(item: T) -> AnalysisRow:
+        geometry = _geometry(place_m(item), gsd_m, is_area=is_area)
+        return AnalysisRow(cells={c.key: c.cell(item) for c in columns}, geometry=geometry)
+
     return AnalysisTable(
         name=name,
         section=section,
         title=title,
         note=note,
         columns=tuple(AnalysisColumn(name=c.key, title=c.title, unit=c.unit) for c in columns),
-        rows=tuple(AnalysisRow(cells={c.key: c.cell(item) for c in columns}, geometry=place(item)) for item in items),
+        rows=tuple(map(row, items)),
     )
+
+
+def _geometry(xy_m: FloatArray | None, gsd_m: float, *, is_area: bool) -> GeometryRecord | None:
+    if xy_m is None:
+        return None
+    kind: Literal["Point", "LineString", "Polygon"] = "Polygon" if is_area else "LineString"
+    return GeometryRecord(type="Point" if xy_m.ndim == 1 else kind, xy_px=points_px(np.atleast_2d(xy_m), gsd_m))
 
 
 def in_speed_unit(table: AnalysisTable, unit: SpeedUnit) -> AnalysisTable:
@@ -118,18 +138,3 @@ def estimate_cell(estimate: Estimate | None, factor: float = 1.0) -> EstimateRec
     scaled = estimate.in_units(factor)
     value, low, high = (float(f"{number:.4g}") for number in (scaled.value, scaled.low, scaled.high))
     return EstimateRecord(value=value, low=low, high=high, n=estimate.n)
-
-
-def point_geometry(xy_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecord:
-    """A place (2,) m."""
-    return GeometryRecord(type="Point", xy_px=points_px(np.atleast_2d(xy_m), analysis.trajectories.gsd_m))
-
-
-def line_geometry(xy_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecord:
-    """A line (n, 2) m."""
-    return GeometryRecord(type="LineString", xy_px=points_px(xy_m, analysis.trajectories.gsd_m))
-
-
-def polygon_geometry(corners_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecord:
-    """An area of corners (n, 2) m."""
-    return GeometryRecord(type="Polygon", xy_px=points_px(corners_m, analysis.trajectories.gsd_m))

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.analysis import AnalysisTable, Cell, GeometryRecord
-from schemas.arrays import IntArray
+from schemas.analysis import AnalysisTable, Cell
+from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.vehicle_classes import COUNTED_CLASSES, HEAVY, VehicleClasses
-from velfield.pipeline.analysis.cells import Column, estimate_cell, line_geometry, make_table
+from velfield.analysis.vehicle_classes import COUNTED_CLASSES, VehicleClasses
+from velfield.pipeline.analysis.cells import Column, estimate_cell, make_table
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class _Group:
     vehicles: float
     measured: int
     shares: Sequence[Estimate | None]
-    geometry: GeometryRecord | None
+    place_m: FloatArray | None
 
 
 def class_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -49,35 +49,29 @@ def class_table(analysis: TrafficAnalysis) -> AnalysisTable:
     if analysis.classes is None:
         note = "Lengths and widths in metres are not known of these tracks."
     rows = _groups(analysis, analysis.classes) if analysis.classes else ()
-    return make_table("classes", "Movements", "Vehicles by class", note, columns, rows, lambda group: group.geometry)
-
-
-def heavy_share(analysis: TrafficAnalysis, tracks: IntArray) -> Estimate | None:
-    """Share of lorries and buses among the vehicles of some tracks."""
-    return analysis.classes.estimate_shares(tracks)[HEAVY] if analysis.classes else None
+    title = "Vehicles by class"
+    return make_table(analysis, "classes", "Movements", title, note, columns, rows, lambda group: group.place_m)
 
 
 def _groups(analysis: TrafficAnalysis, classes: VehicleClasses) -> Iterator[_Group]:
-    def group(kind: str, name: str, vehicles: float, tracks: IntArray, geometry: GeometryRecord | None) -> _Group:
+    def group(kind: str, name: str, vehicles: float, tracks: IntArray, place_m: FloatArray | None) -> _Group:
         measured = int(np.isin(tracks, classes.measured).sum())
-        return _Group(kind, name, vehicles, measured, classes.estimate_shares(tracks), geometry)
+        return _Group(kind, name, vehicles, measured, classes.estimate_shares(tracks), place_m)
 
     n = len(analysis.trajectories)
     yield group("picture", "all tracks that move", float(n), np.arange(n), None)
     for found in analysis.movements:
         for m in found.movements:
             name = f"{analysis.junction_kind(m.junction)} {m.junction}, {m.arm_in} to {m.arm_out}"
-            geometry = line_geometry(m.line_m, analysis)
-            yield group("movement", name, m.seen + m.inferred, found.tracks(m), geometry)
+            yield group("movement", name, m.seen + m.inferred, found.tracks(m), m.line_m)
     scene = analysis.scene
     if scene is not None:
         for r in scene.relations:
             trips = scene.trips
             rows = (trips.origin == r.origin.number) & (trips.destination[:, r.destination.number] == 1.0)
-            geometry = line_geometry(np.array([r.origin.xy_m, r.destination.xy_m]), analysis)
+            line_m = np.array([r.origin.xy_m, r.destination.xy_m])
             name = f"{r.origin.name} to {r.destination.name}"
-            yield group("origin to destination", name, r.vehicles, trips.track[rows], geometry)
+            yield group("origin to destination", name, r.vehicles, trips.track[rows], line_m)
     for lane in analysis.lanes:
         passing = analysis.lane_traffic.passings(lane.number, lane.length_m / 2)
-        geometry = line_geometry(lane.xy_m, analysis)
-        yield group("lane", f"lane {lane.number}, at its middle", float(len(passing)), passing.track, geometry)
+        yield group("lane", f"lane {lane.number}, at its middle", float(len(passing)), passing.track, lane.xy_m)

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.analysis import AnalysisTable, GeometryRecord
+from schemas.analysis import AnalysisTable
+from schemas.arrays import FloatArray
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.intervals import MIN_VEHICLES
 from velfield.analysis.lanes.model import Lane
 from velfield.analysis.signals.coordination import Offset, QueueGrowth, find_offsets, queue_growth
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.pipeline.analysis.cells import KM_PER_H, Column, estimates, line_geometry, make_table, point_geometry
+from velfield.pipeline.analysis.cells import KM_PER_H, Column, estimates, make_table
 
 _SLICE_S, _MAX_SLICES = 60.0, 60
 
@@ -44,8 +45,8 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "a row is a point of the lane's diagram."
     )
     return make_table(
-        "fundamental_diagram", "Flow", "Fundamental diagram of lanes", note, columns, _slices(analysis, slice_s),
-        lambda s: line_geometry(s.lane.xy_m, analysis),
+        analysis, "fundamental_diagram", "Flow", "Fundamental diagram of lanes", note, columns,
+        _slices(analysis, slice_s), lambda s: s.lane.xy_m,
     )  # fmt: skip
 
 
@@ -74,11 +75,10 @@ def growth_table(analysis: TrafficAnalysis) -> AnalysisTable:
     ]
     rows = (g for signal in analysis.signals.values() for g in queue_growth(signal))
     note = "Mean over the cycles of the flight; n is their number. Of streams whose onset of red is known."
-
-    def place(g: QueueGrowth) -> GeometryRecord:
-        return point_geometry(analysis.lanes.junctions[g.junction].centre_m, analysis)
-
-    return make_table("queue_growth", "Signals", "Queues in red", note, columns, rows, place)
+    return make_table(
+        analysis, "queue_growth", "Signals", "Queues in red", note, columns, rows,
+        lambda g: analysis.lanes.junctions[g.junction].centre_m,
+    )  # fmt: skip
 
 
 def offset_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -95,8 +95,7 @@ def offset_table(analysis: TrafficAnalysis) -> AnalysisTable:
     offsets, reason = find_offsets(analysis.signals, analysis.lanes, analysis.trajectories.observed_s)
     note = reason or "Of junctions whose cycles agree within their intervals, from the green of the one to the next's."
 
-    def place(o: Offset) -> GeometryRecord:
-        centres = [analysis.lanes.junctions[k].centre_m for k in (o.junction_a, o.junction_b)]
-        return line_geometry(np.array(centres), analysis)
+    def place(o: Offset) -> FloatArray:
+        return np.array([analysis.lanes.junctions[k].centre_m for k in (o.junction_a, o.junction_b)])
 
-    return make_table("offsets", "Signals", "Offsets between junctions", note, columns, offsets, place)
+    return make_table(analysis, "offsets", "Signals", "Offsets between junctions", note, columns, offsets, place)

@@ -4,20 +4,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from schemas.analysis import AnalysisTable, GeometryRecord
+from schemas.analysis import AnalysisTable
 from velfield.analysis.movements.car_parks import CarPark
 from velfield.analysis.movements.gates import Arm
 from velfield.analysis.movements.scene import OriginDestination, Relation
 from velfield.analysis.movements.time_slices import SliceCount
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.pipeline.analysis.cells import (
-    Column,
-    estimates,
-    line_geometry,
-    make_table,
-    point_geometry,
-    polygon_geometry,
-)
+from velfield.pipeline.analysis.cells import Column, estimates, make_table
 
 
 def scene_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
@@ -31,12 +24,8 @@ def matrix_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Vehicles, seen and inferred, by origin (rows) and destination (columns)."""
     scene, title = analysis.scene, "Origins and destinations, vehicles"
     columns: list[Column[Arm]] = [Column("from", "From", "", lambda arm: arm.name)]
-
-    def place(arm: Arm) -> GeometryRecord:
-        return point_geometry(arm.xy_m, analysis)
-
     if scene is None:
-        return make_table("origins", "Movements", title, "", columns, (), place)
+        return make_table(analysis, "origins", "Movements", title, "", columns, (), lambda arm: arm.xy_m)
     entries, exits = (
         [arm for arm in scene.arms if any(g.arm == arm.number and g.inwards == inwards for g in scene.gates)]
         for inwards in (True, False)
@@ -56,7 +45,8 @@ def matrix_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
     columns += map(column, exits)
     columns += [Column("unknown", "Not known where", "", unknown, 1), Column("all", "All", "", entered)]
-    return make_table("origins", "Movements", title, _note(scene), columns, entries, place)
+    note = _note(scene)
+    return make_table(analysis, "origins", "Movements", title, note, columns, entries, lambda arm: arm.xy_m)
 
 
 def _note(scene: OriginDestination) -> str:
@@ -87,12 +77,11 @@ def relation_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "A vehicle whose track is cut, and not found again, is taken to go where the others went that drove where it "
         "was lost."
     )
-
-    def place(r: Relation) -> GeometryRecord:
-        return line_geometry(np.array([r.origin.xy_m, r.destination.xy_m]), analysis)
-
     relations = analysis.scene.relations if analysis.scene else ()
-    return make_table("origin_destination", "Movements", "From origin to destination", note, columns, relations, place)
+    return make_table(
+        analysis, "origin_destination", "Movements", "From origin to destination", note, columns, relations,
+        lambda r: np.array([r.origin.xy_m, r.destination.xy_m]),
+    )  # fmt: skip
 
 
 def car_park_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -111,8 +100,8 @@ def car_park_table(analysis: TrafficAnalysis) -> AnalysisTable:
     if analysis.parked is None:
         note = "Parked vehicles are not known of these tracks."
     return make_table(
-        "car_parks", "Movements", "Through traffic of car parks", note, columns, analysis.car_parks,
-        lambda park: polygon_geometry(park.hull_m, analysis),
+        analysis, "car_parks", "Movements", "Through traffic of car parks", note, columns, analysis.car_parks,
+        lambda park: park.hull_m, is_area=True,
     )  # fmt: skip
 
 
@@ -133,13 +122,11 @@ def time_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
     junction: Column[SliceCount] = Column("junction", "Junction", "", lambda c: c.junction)
     lines = {(m.junction, m.arm_in, m.arm_out): m.line_m for found in analysis.movements for m in found.movements}
     yield make_table(
-        "movements_by_time", "Movements", "Turning counts by time", note, [junction, *columns],
-        analysis.counts_by_time,
-        lambda c: line_geometry(lines[c.junction or 0, c.arm_in, c.arm_out], analysis),
+        analysis, "movements_by_time", "Movements", "Turning counts by time", note, [junction, *columns],
+        analysis.counts_by_time, lambda c: lines[c.junction or 0, c.arm_in, c.arm_out],
     )  # fmt: skip
     arms = {arm.name: arm.xy_m for arm in analysis.scene.arms} if analysis.scene else {}
     yield make_table(
-        "origin_destination_by_time", "Movements", "From origin to destination by time", note, columns,
-        analysis.scene_by_time,
-        lambda c: line_geometry(np.array([arms[c.arm_in], arms[c.arm_out]]), analysis),
+        analysis, "origin_destination_by_time", "Movements", "From origin to destination by time", note, columns,
+        analysis.scene_by_time, lambda c: np.array([arms[c.arm_in], arms[c.arm_out]]),
     )  # fmt: skip

@@ -1,10 +1,10 @@
 """Answers as tables (`schemas.analysis.AnalysisTable`), which the page, the report and the workbook show."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from schemas.analysis import AnalysisTable, GeometryRecord
+from schemas.analysis import AnalysisTable
 from schemas.arrays import FloatArray
 from schemas.export import SpeedUnit
 from velfield.analysis.answers import TWO_LEVELS
@@ -18,16 +18,8 @@ from velfield.analysis.signals.cycles import JunctionSignal, Queue, StreamSignal
 from velfield.analysis.signals.phases import START_DELAY_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.unusual import DoubtfulPlace, Unusual
-from velfield.pipeline.analysis.cells import (
-    KM_PER_H,
-    Column,
-    estimates,
-    in_speed_unit,
-    line_geometry,
-    make_table,
-    point_geometry,
-)
-from velfield.pipeline.analysis.class_tables import class_table, heavy_share
+from velfield.pipeline.analysis.cells import KM_PER_H, Column, estimates, in_speed_unit, make_table
+from velfield.pipeline.analysis.class_tables import class_table
 from velfield.pipeline.analysis.flow_tables import diagram_table, growth_table, offset_table
 from velfield.pipeline.analysis.scene_tables import scene_tables, time_tables
 
@@ -72,7 +64,7 @@ def lane_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("successors", "Leads to lanes", "", lambda lane: _numbers(graph.successors[lane.number])),
     ]
     note = "Lanes that fewer than three tracks drove are not found."
-    return make_table("lanes", "Lanes", "Lanes", note, columns, graph, lambda lane: line_geometry(lane.xy_m, analysis))
+    return make_table(analysis, "lanes", "Lanes", "Lanes", note, columns, graph, lambda lane: lane.xy_m)
 
 
 def profile_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -92,8 +84,8 @@ def profile_table(analysis: TrafficAnalysis) -> AnalysisTable:
         others = ", ".join(str(lane) for lane in profiles if lane not in known)
         note += f" Of too few vehicles for any, and left out: lanes {others}."
     stations = (station for lane in known for station in profiles[lane])
-    place = _at(analysis)
-    return make_table("speed_profile", "Speed", "Speed along lanes", note, columns, stations, lambda s: place(s.xy_m))
+    title = "Speed along lanes"
+    return make_table(analysis, "speed_profile", "Speed", title, note, columns, stations, lambda s: s.xy_m)
 
 
 def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -118,7 +110,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("inferred", "Vehicles inferred", "", lambda row: row[1].inferred, 1),
         estimates("share", "Share of the entry", "%", lambda row: row[1].share, 100.0),
         estimates("flow", "Flow", "veh/h", lambda row: row[1].flow_veh_per_h),
-        estimates("heavy", "Lorries and buses", "%", lambda row: heavy_share(analysis, row[0].tracks(row[1])), 100.0),
+        estimates("heavy", "Lorries and buses", "%", lambda row: analysis.heavy_share(row[0].tracks(row[1])), 100.0),
         estimates("travel_time", "Travel time", "s", lambda row: row[1].travel_time_s),
         estimates("delay", "Delay", "s", lambda row: row[1].delay_s),
         Column("delay_of_part", "Queues end out of view", "", lambda row: partly(row[1])),
@@ -133,11 +125,8 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "Highway Capacity Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere; none where it is not "
         "known which."
     )
-
-    def place(row: tuple[JunctionMovements, Movement]) -> GeometryRecord:
-        return line_geometry(row[1].line_m, analysis)
-
-    return make_table("movements", "Movements", "Turning counts", note, columns, rows, place)
+    title = "Turning counts"
+    return make_table(analysis, "movements", "Movements", title, note, columns, rows, lambda row: row[1].line_m)
 
 
 def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -147,10 +136,8 @@ def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("time", "Time", "s", lambda found: found.time_s, 1),
         Column("side", "To the", "", lambda found: "left" if found.left else "right"),
     ]
-    note, place = "Reversals within 36 m, outside circles and car parks.", _at(analysis)
-    return make_table(
-        "u_turns", "Movements", "U-turns", note, columns, analysis.reversals, lambda found: place(found.xy_m)
-    )
+    note, rows = "Reversals within 36 m, outside circles and car parks.", analysis.reversals
+    return make_table(analysis, "u_turns", "Movements", "U-turns", note, columns, rows, lambda found: found.xy_m)
 
 
 def limit_table(analysis: TrafficAnalysis, unit: SpeedUnit = "km/h") -> AnalysisTable:
@@ -165,11 +152,10 @@ def limit_table(analysis: TrafficAnalysis, unit: SpeedUnit = "km/h") -> Analysis
         "Median speed of vehicles that keep their speed over 30 m, 4 s and more behind the one before; speeds of those "
         f"that follow within 3 s are lower bounds. The limit is the multiple of {SIGNS[unit]:g} {unit} nearest to it."
     )
-
-    def place(road: FreeFlow) -> GeometryRecord:
-        return line_geometry(analysis.lanes.lanes[road.lanes[0]].xy_m, analysis)
-
-    return make_table("free_flow", "Speed", "Free flow and speed limit", note, columns, analysis.free_flow, place)
+    return make_table(
+        analysis, "free_flow", "Speed", "Free flow and speed limit", note, columns, analysis.free_flow,
+        lambda road: analysis.lanes.lanes[road.lanes[0]].xy_m,
+    )  # fmt: skip
 
 
 def reduction_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -183,17 +169,16 @@ def reduction_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("after", "Speed after", "km/h", lambda r: r.after_m_per_s, KM_PER_H),
         estimates("recovery", "Recovers over", "m", lambda r: r.recovery_m),
     ]
-    title, note, place = "Speed reduction at junctions", "Of vehicles that neither stop nor give way.", _at(analysis)
-    junctions = analysis.lanes.junctions
+    note = "Of vehicles that neither stop nor give way."
     return make_table(
-        "speed_reduction", "Speed", title, note, columns, analysis.reductions,
-        lambda r: place(junctions[r.junction].centre_m),
+        analysis, "speed_reduction", "Speed", "Speed reduction at junctions", note, columns, analysis.reductions,
+        lambda r: analysis.lanes.junctions[r.junction].centre_m,
     )  # fmt: skip
 
 
 def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Signals by junction."""
-    names, junctions = {True: "yes", False: "no", None: "too little data"}, analysis.lanes.junctions
+    names = {True: "yes", False: "no", None: "too little data"}
 
     def said(signal: JunctionSignal) -> str:
         if analysis.junction_kind(signal.junction) == "crossing":
@@ -211,10 +196,9 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     note = (
         "From the starts of vehicles at stop lines. A signal that traffic actuates has no fixed cycle and is not found."
     )
-    place = _at(analysis)
     return make_table(
-        "signals", "Signals", "Signals", note, columns, analysis.signals.values(),
-        lambda signal: place(junctions[signal.junction].centre_m),
+        analysis, "signals", "Signals", "Signals", note, columns, analysis.signals.values(),
+        lambda signal: analysis.lanes.junctions[signal.junction].centre_m,
     )  # fmt: skip
 
 
@@ -243,11 +227,11 @@ def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
         f"{START_DELAY_S:.1f} s after its green."
     )
 
-    def place(row: tuple[int, StreamSignal, list[Queue]]) -> GeometryRecord:
+    def place(row: tuple[int, StreamSignal, list[Queue]]) -> FloatArray:
         path = row[1].stream.approach.path_m
-        return point_geometry(path[int(np.clip(row[1].stream.stop_line_m or 0, 0, len(path) - 1))], analysis)
+        return np.asarray(path[int(np.clip(row[1].stream.stop_line_m or 0, 0, len(path) - 1))])
 
-    return make_table("streams", "Signals", "Streams at signals", note, columns, rows, place)
+    return make_table(analysis, "streams", "Signals", "Streams at signals", note, columns, rows, place)
 
 
 def flow_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -261,11 +245,10 @@ def flow_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("gap", "Gap of those that follow", "s", lambda flow: flow.gap_s),
     ]
     note = "Density and speed by Edie's definitions over the lane; flow and headways at its middle."
-
-    def place(flow: LaneFlow) -> GeometryRecord:
-        return line_geometry(analysis.lanes.lanes[flow.lane].xy_m, analysis)
-
-    return make_table("flow", "Flow", "Flow by lane", note, columns, analysis.flows, place)
+    return make_table(
+        analysis, "flow", "Flow", "Flow by lane", note, columns, analysis.flows,
+        lambda flow: analysis.lanes.lanes[flow.lane].xy_m,
+    )  # fmt: skip
 
 
 def conflict_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -284,8 +267,7 @@ def conflict_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "Following: least time to collision behind a leader; a conflict needs braking harder than "
         f"{HARD_BRAKING_M_PER_S2} m/s2, too. Crossing and merging: post-encroachment time."
     )
-    place = _at(analysis)
-    return make_table("conflicts", "Conflicts", "Conflicts", note, columns, rows, lambda c: place(c.xy_m))
+    return make_table(analysis, "conflicts", "Conflicts", "Conflicts", note, columns, rows, lambda c: c.xy_m)
 
 
 def unusual_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -297,8 +279,8 @@ def unusual_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("time", "Time", "s", lambda u: u.time_s, 1),
         Column("detail", "What", "", lambda u: u.detail),
     ]
-    note, place = "Look at them: an error of tracking is one too.", _at(analysis)
-    return make_table("unusual", "Unusual", "Unusual tracks", note, columns, analysis.unusual, lambda u: place(u.xy_m))
+    note, rows = "Look at them: an error of tracking is one too.", analysis.unusual
+    return make_table(analysis, "unusual", "Unusual", "Unusual tracks", note, columns, rows, lambda u: u.xy_m)
 
 
 def doubtful_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -307,14 +289,9 @@ def doubtful_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("short_tracks", "Short tracks", "", lambda at: at.short_tracks),
         Column("tracks", "Tracks", "", lambda at: at.tracks),
     ]
-    title, place = "Places where false motion is likely", _at(analysis)
+    title, rows = "Places where false motion is likely", analysis.doubtful_places
     note = "Squares of 12 m in which most tracks are shorter than 15 m, as false ones in dense car parks are."
-    rows = analysis.doubtful_places
-    return make_table("doubtful", "Unusual", title, note, columns, rows, lambda at: place(at.xy_m))
-
-
-def _at(analysis: TrafficAnalysis) -> Callable[[FloatArray], GeometryRecord]:
-    return lambda xy_m: point_geometry(xy_m, analysis)
+    return make_table(analysis, "doubtful", "Unusual", title, note, columns, rows, lambda at: at.xy_m)
 
 
 def _track_id(analysis: TrafficAnalysis, track: int) -> int:
