@@ -132,7 +132,7 @@ def test_sumo_fcd_is_in_metres_seconds_and_navigational_degrees(tracklets):
     }
     assert (north.get("angle"), north.get("speed")) == ("0.00", "7.50")
     assert float(north.get("y")) == pytest.approx((199.5 - 150) * GSD_M, abs=0.01)
-    with pytest.raises(InputError, match="run with --gsd-m"):
+    with pytest.raises(InputError, match="no scale"):
         sumo_fcd(tracklets, Georeference((200, 300)))
 
 

@@ -9,6 +9,7 @@ from rasterio.warp import transform
 from schemas.arrays import FloatArray, Points
 from schemas.records import GridRecord
 from velfield.errors import InputError
+from velfield.field.segments import require_gsd_m
 from velfield.run.frame_transforms import heading_deg
 
 MPS_TO_KMH = 3.6
@@ -74,10 +75,8 @@ class Georeference:
         InputError
             The ground sample distance is unknown.
         """
-        if self.gsd_m is None:
-            raise InputError("the run has no scale, and this format needs metres; run with --gsd-m")
-        rows = self.shape[0]
-        return np.column_stack([xy_px[:, 0] + 0.5, rows - 0.5 - xy_px[:, 1]]) * self.gsd_m
+        gsd_m = require_gsd_m(self.gsd_m)
+        return np.column_stack([xy_px[:, 0] + 0.5, self.shape[0] - 0.5 - xy_px[:, 1]]) * gsd_m
 
     def heading_deg(self, xy_px: Points, velocity_px_per_s: Points) -> FloatArray:
         """Direction of travel, degrees clockwise from north; from the image's top where there is no reference system.

@@ -8,7 +8,6 @@ import numpy as np
 from schemas.export import ExportOptions
 from velfield.errors import InputError
 from velfield.exports.pictures.figures import resized_map
-from velfield.field.segments import stationary_speed_px_per_s
 from velfield.report.drawing import POINTS_PER_INCH, figure_bytes, new_figure
 from velfield.report.figures import MapScale, direction_map, speed_map
 from velfield.report.panel import WIDTH_EM, draw_legend
@@ -49,13 +48,10 @@ def draw_poster(run: Run, options: ExportOptions) -> "Figure":
     figure = new_figure(*(sheet_mm / _MM_PER_INCH))
     figure.text(_MARGIN / sheet_mm[0], 1 - 14 / sheet_mm[1], "Velocity field", fontsize=18, fontweight="bold")
     figure.text(_MARGIN / sheet_mm[0], 1 - 21 / sheet_mm[1], "; ".join(_facts(run, options)), fontsize=9)
-    slow = stationary_speed_px_per_s(run.record.config.field, run.grid.gsd_m)
-    speed = run.field.modal_speed_px_per_s()
-    direction = np.where(speed >= slow, run.field.modal_direction_rad(), np.nan)
     em = _LEGEND / WIDTH_EM
     # the layers are in base pixels a second, whatever the width of the sheet's maps
     scale = MapScale(run.grid.gsd_m, options.unit, north_direction_rad(run.grid))
-    for k, values in enumerate((direction, speed)):
+    for k, values in enumerate((run.field.modal_direction_rad(), run.field.modal_speed_px_per_s())):
         shown = resized_map(run, values, sized)
         image, legend = (speed_map if k else direction_map)(shown.grey, shown.layer, scale)
         left = _MARGIN + k * (column + _GAP)

@@ -16,7 +16,7 @@ from schemas.arrays import FloatArray, GreyImage, IntArray, Mask, RGBImage
 from schemas.export import ExportOptions
 from velfield.errors import InputError
 from velfield.exports.pictures.figures import resized_map
-from velfield.field.segments import Segments, stationary_speed_px_per_s
+from velfield.field.segments import Segments
 from velfield.report.colours import ramp_colours
 from velfield.report.figures import MapScale, colour_scale_max, round_up
 from velfield.report.panel import Legend, legend_panel
@@ -111,8 +111,7 @@ class _Scene:
     @classmethod
     def of(cls, run: Run, options: ExportOptions) -> "_Scene":
         width = options.width_px or min(run.grid.width_px, _DEFAULT_WIDTH_PX)
-        slow = stationary_speed_px_per_s(run.record.config.field, run.grid.gsd_m)
-        speed = run.field.modal_speed_px_per_s()
+        slow, speed = run.field.stationary_speed_px_per_s, run.field.modal_speed_px_per_s()
         shown = resized_map(run, np.where(speed >= slow, speed, np.nan), options.model_copy(update={"width_px": width}))
         if max(shown.grey.shape) > _MAX_SIDE_PX:
             raise InputError(

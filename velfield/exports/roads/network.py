@@ -61,8 +61,7 @@ def road_network(run: Run) -> RoadNetwork:
     InputError
         The ground sample distance is not known, or no lanes were found.
     """
-    if run.grid.gsd_m is None:
-        raise InputError("the run has no scale, and roads need metres; run with --gsd-m")
+    gsd_m = run.gsd_m
     graph, trajectories = run.analysis.lanes(), run.analysis.trajectories
     if not len(graph):
         raise InputError("no lanes were found in the tracks of this run; a longer flight shows more traffic")
@@ -74,7 +73,7 @@ def road_network(run: Run) -> RoadNetwork:
         lanes.append(
             RoadLane(
                 number=lane.number,
-                xy_m=georeference.to_metres(lane.xy_m / run.grid.gsd_m),
+                xy_m=georeference.to_metres(lane.xy_m / gsd_m),
                 width_m=float(np.clip(lane.width_m, 2.0, 6.0)),
                 speed_m_per_s=float(speeds.mean()),
                 high_speed_m_per_s=float(max(np.percentile(speeds, 85), 1.0)),

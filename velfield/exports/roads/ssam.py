@@ -31,7 +31,7 @@ _TURNS_M_PER_S = 1.0
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
     table = trajectory_table(run)
-    size_m = np.array([run.grid.width_px, run.grid.height_px]) * (run.grid.gsd_m or np.nan)
+    size_m = np.array([run.grid.width_px, run.grid.height_px]) * run.gsd_m
     table["y_m"] = size_m[1] - table["y_m"]
     table[["vy_m_per_s", "ay_m_per_s2"]] *= -1
     return ssam_records(table, size_m)

@@ -3,7 +3,6 @@
 import numpy as np
 import pandas as pd
 
-from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
 from velfield.run.run import Run
 
@@ -25,8 +24,7 @@ def trajectory_table(run: Run) -> pd.DataFrame:
     InputError
         The ground sample distance is not known.
     """
-    if run.grid.gsd_m is None:
-        raise InputError("the run has no scale, and this table needs metres; run with --gsd-m")
+    gsd_m = run.gsd_m
     paths, samples = run.analysis.trajectories, run.analysis.lanes().samples
     owner = paths.owner
     acceleration = np.zeros_like(paths.velocity_m_per_s)
@@ -39,7 +37,7 @@ def trajectory_table(run: Run) -> pd.DataFrame:
             mine = mine[np.argsort(samples.time_s[mine], kind="stable")]
             after = np.searchsorted(samples.time_s[mine], paths.time_s[rows]).clip(0, len(mine) - 1)
             lane[rows] = samples.lane[mine[after]]
-    xy_px, velocity = paths.xy_m / run.grid.gsd_m, paths.velocity_m_per_s
+    xy_px, velocity = paths.xy_m / gsd_m, paths.velocity_m_per_s
     georeference = Georeference.from_grid(run.grid)
     table = pd.DataFrame(
         {
