@@ -109,29 +109,6 @@ class StageBars:
             progress.at_least(progress.done + steps)
 
 
-@contextmanager
-def training_progress() -> Iterator[None]:
-    """A bar of the steps of a training; where there is no terminal, a line every ten seconds."""
-    console = RichConsole(stderr=True, highlight=False)
-    console.print("training on the labelled cars: up to some minutes", markup=False)
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn())
-    done, total, lock, printed_s = 0, 0, threading.Lock(), time.monotonic()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("training", total=None)
-
-        def count(steps: int, announced: int) -> None:
-            nonlocal done, total, printed_s
-            with lock:
-                done, total = done + steps, total + announced
-                bar.update(task, completed=done, total=total)
-                if not console.is_terminal and time.monotonic() - printed_s > _LINE_EVERY_S:
-                    printed_s = time.monotonic()
-                    console.print(f"training: {done} of {total} steps", markup=False)
-
-        with subscribe_steps(count):
-            yield
-
-
 def print_with_time(text: str) -> None:
     """Print a line with the time of day, from a process that serves."""
     print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)

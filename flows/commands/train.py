@@ -53,10 +53,12 @@ def train(
     for file in (out, review):
         if file is not None and not file.parent.is_dir():
             raise InputError(f"{file}: the folder {file.parent} does not exist; create it first")
-    from flows.console import training_progress
+    from flows.console import Console
 
     stop_on_signals(resumes=False, grace_s=0.0)
-    with training_progress():
+    console = Console()
+    console.event("train", "training on the labelled cars: up to some minutes")
+    with console.stage("detector", "training", 0):
         training = train_from_labels(source, labels, resolved, continued=continued)
     print("\n".join(write_training(training, out, review)))
     return 0
