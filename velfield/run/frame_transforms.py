@@ -9,7 +9,8 @@ The base image of a run and the grid of its pixels.
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from schemas.arrays import FloatArray, GreyImage
 from schemas.camera import CameraRecord, PolynomialLensRecord
 from schemas.flight import FlightConfig, FramesConfig, RegistrationConfig
 from schemas.georeference import GeoreferenceRecord
+from schemas.model import Model
 from schemas.records import (
     GridRecord,
     OwnToBaseRecord,
@@ -41,6 +43,7 @@ from velfield.run.layout import RunLayout, local_copy
 from velfield.run.stores import RegistrationStore, open_frames, open_registration
 
 _MAX_MAPS = 64
+R = TypeVar("R", bound=Model)
 
 
 def read_grid(layout: RunLayout) -> GridRecord:
@@ -51,10 +54,7 @@ def read_grid(layout: RunLayout) -> GridRecord:
     InputError
         There is no base image yet.
     """
-    if not layout.grid.exists():
-        raise InputError(f"{layout.grid} does not exist: run `velfield run` on this folder first")
-    grid = _parse_grid(layout.grid.read_bytes())
-    record = read_georeference(layout)
+    grid, record = read_own_grid(layout), read_georeference(layout)
     return grid if record is None else _apply_georeference(grid, record)
 
 
@@ -77,26 +77,36 @@ def read_tracking_gsd(layout: RunLayout) -> float | None:
 
 def read_own_grid(layout: RunLayout) -> GridRecord:
     """``base/grid.json`` alone: what the base image itself gives."""
-    return _parse_grid(layout.grid.read_bytes())
+    return _read(layout.grid, GridRecord)
 
 
 def read_georeference(layout: RunLayout) -> GeoreferenceRecord | None:
     """``base/scale.json``; before its stage, and in runs that had none, `read_first_georeference`."""
-    if not layout.scale.exists():
-        return read_first_georeference(layout)
-    return _parse_georeference(layout.scale.read_bytes())
+    return _read(layout.scale, GeoreferenceRecord) if layout.scale.exists() else read_first_georeference(layout)
 
 
 def read_first_georeference(layout: RunLayout) -> GeoreferenceRecord | None:
     """``base/georeference.json``, without the lengths of vehicles; None before its stage, and in runs that had none."""
-    if not layout.georeference.exists():
-        return None
-    return _parse_georeference(layout.georeference.read_bytes())
+    return _read(layout.georeference, GeoreferenceRecord) if layout.georeference.exists() else None
 
 
-@lru_cache(maxsize=8)
-def _parse_georeference(data: bytes) -> GeoreferenceRecord:
-    return GeoreferenceRecord.model_validate_json(data)
+def _read(path: Path, model: type[R]) -> R:
+    """A record of the run folder.
+
+    Raises
+    ------
+    InputError
+        It is not there yet.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist: run `velfield run` on this folder first")
+    found: R = _parse(model, path.read_bytes())
+    return found
+
+
+@lru_cache(maxsize=32)
+def _parse(model: type[R], data: bytes) -> R:
+    return model.model_validate_json(data)
 
 
 @lru_cache(maxsize=8)
@@ -122,9 +132,7 @@ def read_working(layout: RunLayout) -> WorkingRecord:
     InputError
         There is no detector yet.
     """
-    if not layout.working.exists():
-        raise InputError(f"{layout.working} does not exist: run `velfield run` on this folder first")
-    return WorkingRecord.model_validate_json(layout.working.read_bytes())
+    return _read(layout.working, WorkingRecord)
 
 
 def read_base_image(layout: RunLayout, config: FramesConfig) -> GreyImage:
@@ -157,11 +165,6 @@ def heading_deg(direction_rad: FloatArray, north_rad: float | None) -> FloatArra
     return np.mod(np.degrees(direction_rad - (-np.pi / 2 if north_rad is None else north_rad)), 360.0)
 
 
-@lru_cache(maxsize=8)
-def _parse_grid(data: bytes) -> GridRecord:
-    return GridRecord.model_validate_json(data)
-
-
 def read_lens(layout: RunLayout) -> Lens:
     """The lens of ``camera.json``, or that by the given base image.
 
@@ -170,11 +173,8 @@ def read_lens(layout: RunLayout) -> Lens:
     InputError
         The lens was not calibrated yet.
     """
-    if not layout.camera.exists():
-        raise InputError(f"{layout.camera} does not exist: run `velfield run` on this folder first")
-    if layout.map_lens.exists():
-        return lens_from_record(PolynomialLensRecord.model_validate_json(layout.map_lens.read_bytes()))
-    return lens_from_record(CameraRecord.model_validate_json(layout.camera.read_bytes()).lens)
+    camera = _read(layout.camera, CameraRecord)
+    return lens_from_record(_read(layout.map_lens, PolynomialLensRecord) if layout.map_lens.exists() else camera.lens)
 
 
 def polyprojective_to_record(transform: PolyprojectiveTransform) -> PolyprojectiveRecord:
@@ -237,9 +237,9 @@ def _base_maps(layout: RunLayout) -> tuple[BaseMap, ...]:
     """Maps from the image that frames are registered to on to base pixels, in order; mostly none."""
     maps = []
     if layout.own_to_base.exists():
-        maps.append(_own_to_base(OwnToBaseRecord.model_validate_json(layout.own_to_base.read_bytes())))
+        maps.append(_own_to_base(_read(layout.own_to_base, OwnToBaseRecord)))
     if layout.rebased.exists():
-        record = RebaseRecord.model_validate_json(layout.rebased.read_bytes())
+        record = _read(layout.rebased, RebaseRecord)
         maps.append(BaseMap(polyprojective_from_record(record.transform), sd_px=record.added_error_px))
     return tuple(maps)
 
