@@ -7,6 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from velfield.analysis.changes import find_changes
+from velfield.analysis.intervals import Estimate
 from velfield.exports.gis.cog import write_cog
 from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
 from velfield.field.segments import stationary_speed_px_per_s
@@ -80,14 +81,8 @@ def _traffic_lines(before: Run, after: Run, out: Path) -> list[str]:
         {
             "what": c.what,
             "unit": c.unit,
-            "before": c.before.value,
-            "before_low": c.before.low,
-            "before_high": c.before.high,
-            "before_n": c.before.n,
-            "after": c.after.value,
-            "after_low": c.after.low,
-            "after_high": c.after.high,
-            "after_n": c.after.n,
+            **_columns("before", c.before),
+            **_columns("after", c.after),
             "p_value": c.p_value,
             "significant": c.significant,
         }
@@ -99,6 +94,15 @@ def _traffic_lines(before: Run, after: Run, out: Path) -> list[str]:
     return lines + [
         f"           {c.what}: {c.before.value:.3g} to {c.after.value:.3g} {c.unit}".rstrip() for c in real[:20]
     ]
+
+
+def _columns(name: str, estimate: Estimate) -> dict[str, float]:
+    return {
+        name: estimate.value,
+        f"{name}_low": estimate.low,
+        f"{name}_high": estimate.high,
+        f"{name}_n": estimate.n,
+    }
 
 
 def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> None:

@@ -7,13 +7,14 @@ is under way finds it there.
 """
 
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
 from velfield.pipeline.configuration import resolve_config
-from velfield.pipeline.graphs import compute_here, unit_graph
+from velfield.pipeline.graphs import Graph, compute_here, unit_graph
 from velfield.pipeline.plan import Plan, make_plan, write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES
 from velfield.pipeline.units import prepare_stage, stage_units
@@ -22,15 +23,23 @@ _TINY = SimulationConfig(frames=9, width=480, height=360, seed=3)
 _QUICK = {"detection.fine_tune_steps": 2, "registration.max_keypoints": 800, "gsd_m": 0.23}
 
 
-def compute_stages(plan: Plan, stages: Iterable[str] = tuple(STAGE)) -> None:
-    """Compute stages one after another on this thread; what is finished is computed again."""
+Compute = Callable[[Graph], Any]
+"""Gives the value of a graph."""
+
+
+def compute_stages(plan: Plan, stages: Iterable[str] = tuple(STAGE), compute: Compute = compute_here) -> None:
+    """Compute stages one after another, by default on this thread; what is finished is computed again.
+
+    Units whose detections are lost are left out.
+    """
     chosen = set(stages)
     for stage in STAGES:
         if stage.name not in chosen:
             continue
         prepare_stage(plan, stage)
         for unit in stage_units(plan, stage):
-            compute_here(unit_graph(plan, stage, unit))
+            if f"detections {unit.name}" not in plan.lost:
+                compute(unit_graph(plan, stage, unit))
 
 
 def compile_kernels() -> None:

@@ -109,11 +109,6 @@ class Plan:
         keys = {stage: content_key(stage, 0, inputs=[key, *sorted(lost)]) for stage, key in self.keys.items()}
         return replace(self, keys=keys, lost=(*self.lost, *lost))
 
-    def blocks(self, frames: range) -> list[range]:
-        """A unit's frames cut into Dask blocks."""
-        step = self.config.work.block_frames
-        return [range(start, min(start + step, frames.stop)) for start in range(frames.start, frames.stop, step)]
-
 
 def check_inputs(job: Job) -> None:
     """Check that all inputs exist, before anything that takes long is started.

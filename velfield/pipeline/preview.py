@@ -8,31 +8,29 @@ own, as if the other units were lost: nothing of a preview is taken for the resu
 without them.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from schemas.job import Job
 from schemas.records import InputsRecord
 from schemas.summary import RunSummary
 from velfield.detection.registry import shipped_detector
-from velfield.pipeline.graphs import compute_here, unit_graph
+from velfield.pipeline.graphs import compute_here
+from velfield.pipeline.local import Compute, compute_stages
 from velfield.pipeline.plan import Plan, write_flight_record
 from velfield.pipeline.result import without_progress
-from velfield.pipeline.stage import FIELD_STAGES, STAGE, STAGES, Stage, stage_keys, stages_before
+from velfield.pipeline.stage import FIELD_STAGES, STAGE, STAGES, stage_keys, stages_before
 from velfield.pipeline.stages.report import write_report
 from velfield.pipeline.summary import lost_frames, summarise_stage
-from velfield.pipeline.units import prepare_stage, stage_units
+from velfield.pipeline.units import stage_units
 from velfield.run.commits import commit_path, read_commits, valid_commit, write_atomically
 from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.results import link_shared_outputs
 
 FIRST_FRAMES = 16
 """Frames of the first preview: three seconds."""
-Compute = Callable[[Any], Any]
-"""Gives the value of a Dask graph."""
 Publishing = AbstractContextManager[object]
 """Entered to replace the field and the page of the run; raises where the run's own are being made."""
 
@@ -49,7 +47,7 @@ def make_first_preview(plan: Plan) -> int:
     """
     remove_tree(plan.layout.preview)
     first = _first_plan(plan)
-    _make(first, STAGES, compute_here)
+    _make(first, tuple(STAGE), compute_here)
     _write_page(plan, first, f"the first {first.frame_count} of {plan.frame_count} frames")
     return first.frame_count
 
@@ -68,7 +66,7 @@ def preview_finished_units(plan: Plan, compute: Compute, publishing: Publishing)
     finished = [name for name, record in found.items() if record is not None]
     so_far = _with_root(plan).with_lost_units([f"detections {name}" for name in units if name not in finished])
     link_shared_outputs(plan.layout, so_far.layout, stages_before(FIELD_STAGES[0]))
-    _make(so_far, [STAGE[name] for name in FIELD_STAGES], compute)
+    _make(so_far, FIELD_STAGES, compute)
     frames = sum(units[name] for name in finished)
     _write_page(plan, so_far, f"{frames} of {plan.frame_count} frames")
     with publishing:
@@ -98,14 +96,10 @@ def _first_plan(plan: Plan) -> Plan:
     return replace(first, keys=stage_keys(first.config, record)).with_lost_units(["all other frames"])
 
 
-def _make(plan: Plan, stages: tuple[Stage, ...] | list[Stage], compute: Compute) -> None:
+def _make(plan: Plan, stages: Sequence[str], compute: Compute) -> None:
     write_flight_record(plan)
     with without_progress():
-        for stage in stages:
-            prepare_stage(plan, stage)
-            for unit in stage_units(plan, stage):
-                if f"detections {unit.name}" not in plan.lost:
-                    compute(unit_graph(plan, stage, unit))
+        compute_stages(plan, stages, compute)
 
 
 def _write_page(plan: Plan, preview: Plan, what: str) -> None:
