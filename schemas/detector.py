@@ -146,7 +146,8 @@ class PrecisionRecallCurve(Model):
 
     recall: tuple[float, ...] = Field(max_length=1000)
     precision: tuple[float, ...] = Field(max_length=1000)
-    threshold: tuple[float, ...] = Field(max_length=1000)
+    threshold: tuple[float, ...] = Field((), max_length=1000)
+    """None in the reports of versions before 1.2."""
     operating_point: NonNegativeInt | None = None
     """Index of the chosen threshold."""
     description: str

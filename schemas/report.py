@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from schemas.detector import PrecisionRecallCurve
 from schemas.model import Model
 
 
@@ -28,17 +29,6 @@ class ResidualSeries(Model):
     """Above this a frame is not used."""
 
 
-class PrecisionRecall(Model):
-    """Precision against recall of the detector on held-out labels or frames."""
-
-    recall: tuple[float, ...]
-    precision: tuple[float, ...]
-    operating_point: int | None = None
-    """Index of the score threshold in use."""
-    description: str = ""
-    """Data that the curve was measured on."""
-
-
 class Report(Model):
     """The contents of a run's report."""
 
@@ -56,7 +46,8 @@ class Report(Model):
     """Inputs of the run: base image, ground distance, labels, preset; label and value."""
     stages: tuple[ReportStage, ...] = ()
     residual: ResidualSeries | None = None
-    detection: PrecisionRecall | None = None
+    detection: PrecisionRecallCurve | None = None
+    """Of the detector, on held-out labels."""
     gates: dict[str, int] = Field(default_factory=dict)
     """Counts of what tracking tried, rejected and kept, by the names of `velfield.tracking.gates.GateLog`."""
     notes: tuple[str, ...] = ()

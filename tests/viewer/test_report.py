@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.report import PrecisionRecall, Report, ReportFigure, ReportStage, ResidualSeries
+from schemas.detector import PrecisionRecallCurve
+from schemas.report import Report, ReportFigure, ReportStage, ResidualSeries
 from velfield.errors import InputError
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.report.figures import MapScale, direction_figure, jpeg_bytes, png_bytes, speed_figure
@@ -142,7 +143,9 @@ def made_report() -> tuple[Report, list[ReportFigure]]:
         inputs=(("Base image", "built from the flight"),),
         stages=(ReportStage(name="registration", text="8 of 9 frames", seconds=1.5, lost=1),),
         residual=ResidualSeries(times_s=(0.0, 0.2, 0.4, 0.6), residual_px=(0.3, None, 0.4, 0.5), limit_px=0.45),
-        detection=PrecisionRecall(recall=(0.2, 0.9), precision=(1.0, 0.8), operating_point=1, description="12 cars"),
+        detection=PrecisionRecallCurve(
+            recall=(0.2, 0.9), precision=(1.0, 0.8), threshold=(1.0, 0.5), operating_point=1, description="12 cars"
+        ),
         gates={"links_tried": 1200, "speed": 30, "of_another_time": 7},
         low_coverage_note="Directions hold; speeds are of single vehicles.",
         notes=("lens taken for a pin-hole",),

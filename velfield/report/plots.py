@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from schemas.report import PrecisionRecall, ResidualSeries
+from schemas.detector import PrecisionRecallCurve
+from schemas.report import ResidualSeries
 from velfield.report.drawing import figure_bytes, new_figure
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def residual_plot(series: ResidualSeries) -> bytes:
     return _plot(draw)
 
 
-def precision_recall_plot(curve: PrecisionRecall) -> bytes:
+def precision_recall_plot(curve: PrecisionRecallCurve) -> bytes:
     """SVG of precision against recall, the chosen threshold marked."""
 
     def draw(axes: "Axes") -> None:

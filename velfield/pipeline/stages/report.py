@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.report import PrecisionRecall, Report, ReportStage, ResidualSeries
+from schemas.report import Report, ReportStage, ResidualSeries
 from schemas.summary import RunSummary, StageSummary
 from velfield.analysis.coverage import low_coverage_note, percent
 from velfield.detection.registry import load_detector
@@ -89,7 +89,7 @@ def make_report(plan: Plan, summary: RunSummary) -> Report:
             for s in summary.stages
         ),
         residual=_residual(plan),
-        detection=_curve(plan),
+        detection=load_detector(plan.layout.detector).curve if plan.layout.detector.exists() else None,
         gates=_gates(summary.stages),
         notes=tuple(note for stage in summary.stages for note in stage.notes),
         warnings=(
@@ -146,20 +146,6 @@ def _residual(plan: Plan) -> ResidualSeries:
         times_s=tuple(float(time) for time in times_s),
         residual_px=tuple(float(value) if np.isfinite(value) else None for value in heldout),
         limit_px=plan.config.registration.max_residual_px,
-    )
-
-
-def _curve(plan: Plan) -> PrecisionRecall | None:
-    if not plan.layout.detector.exists():
-        return None
-    curve = load_detector(plan.layout.detector).curve
-    if curve is None:
-        return None
-    return PrecisionRecall(
-        recall=curve.recall,
-        precision=curve.precision,
-        operating_point=curve.operating_point,
-        description=curve.description,
     )
 
 
