@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -128,8 +129,5 @@ def _value(value: Any) -> str:
 
 def _comment(text: str, indent: str) -> list[str]:
     """A paragraph as lines that start with ``##``, unlike keys that are commented out."""
-    words, lines = " ".join(text.split()).split(), [""]
-    for word in words:
-        longer = f"{lines[-1]} {word}".strip()
-        lines[-1:] = [longer] if len(longer) <= _WIDTH - len(indent) else [lines[-1], word]
-    return [f"##{indent} {line}" for line in lines if line]
+    lines = wrap(" ".join(text.split()), _WIDTH - len(indent), break_long_words=False, break_on_hyphens=False)
+    return [f"##{indent} {line}" for line in lines]

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,10 +13,10 @@ from velfield.sources.clips import creation_clock, first_clock
 from velfield.sources.frames import SourceInfo
 from velfield.sources.images import read_image_tags
 from velfield.sources.telemetry.find import find_beside
+from velfield.sources.telemetry.image_tags import exif_time, parse_clock
 from velfield.sources.telemetry.read import read_telemetry, read_telemetry_file
 from velfield.sources.telemetry.telemetry import Telemetry
 
-_TAKEN, _FRACTION = 0x9003, 0x9291  # DateTimeOriginal, SubSecTimeOriginal
 _XMP_TIME = re.compile(
     rb"""(?:exif:DateTimeOriginal|xmp:CreateDate)\s*(?:=\s*["']|>)\s*(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(?:\.(\d+))?"""
 )
@@ -91,14 +90,10 @@ def _capture_time(path: Path) -> _CaptureTime | None:
     except InputError:
         return None
     tags = exif.get_ifd(ExifTags.IFD.Exif)
-    text, digits = str(tags.get(_TAKEN, "")).strip("\0 "), str(tags.get(_FRACTION, "")).strip("\0 ")
+    text, digits = exif_time(tags)
     written = _XMP_TIME.search(xmp)
     kind = "EXIF" if text or not written else "XMP"
     if not text and written:
         text, digits = (part.decode() for part in written.groups(default=b""))
-    try:
-        taken = datetime.strptime(text.replace("-", ":").replace("T", " "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-    except ValueError:
-        return None
-    fraction = float(f"0.{digits}") if digits.isdecimal() else 0.0
-    return _CaptureTime(taken.timestamp() + fraction, 10.0 ** -len(digits) if digits.isdecimal() else 1.0, kind)
+    clock = parse_clock(text, digits)
+    return None if clock is None else _CaptureTime(*clock, kind)

@@ -16,7 +16,7 @@ from schemas.georeference import ControlPoint, ControlPointsRecord, PointResidua
 from velfield.errors import InputError
 from velfield.sources.frames import local_path
 from velfield.sources.geo import ground_sample_distance_m, utm_crs
-from velfield.sources.table import finite_cell, read_csv_rows
+from velfield.sources.table import number_cell, read_csv_rows
 from velfield.sources.telemetry.placement import affine_of_pixels
 
 WGS84 = 4326
@@ -60,10 +60,10 @@ def read_control_points(path: Path | str, epsg: int | None = None) -> tuple[tupl
         raise InputError(f"--epsg {epsg}: found columns {longitude} and {latitude}, which are degrees; omit it")
     points = [
         ControlPoint(
-            x_px=_number(file, line, row, "x_px"),
-            y_px=_number(file, line, row, "y_px"),
-            x=_number(file, line, row, columns[0]),
-            y=_number(file, line, row, columns[1]),
+            x_px=number_cell(file, line, row, "x_px"),
+            y_px=number_cell(file, line, row, "y_px"),
+            x=number_cell(file, line, row, columns[0]),
+            y=number_cell(file, line, row, columns[1]),
             name=row.get("name", ""),
         )
         for line, row in rows
@@ -80,13 +80,6 @@ def _epsg_column(file: Path, rows: Sequence[dict[str, str]]) -> int:
             "or columns longitude and latitude"
         )
     return int(code)
-
-
-def _number(file: Path, line: int, row: dict[str, str], name: str) -> float:
-    value = finite_cell(file, line, row, name)
-    if np.isnan(value):
-        raise InputError(f"{file.name}, line {line}: found no {name}, expected a number; fill it in")
-    return value
 
 
 @dataclass(frozen=True)

@@ -92,3 +92,17 @@ def finite_cell(path: Path, line: int, row: dict[str, str], name: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{path.name}: line {line}: found {name} {text!r}, expected a finite number; fix line {line}")
     return value
+
+
+def number_cell(path: Path, line: int, row: dict[str, str], name: str) -> float:
+    """Number of a cell.
+
+    Raises
+    ------
+    InputError
+        The column is absent, or the cell is empty or not a finite number.
+    """
+    value = finite_cell(path, line, row, name)
+    if math.isnan(value):
+        raise InputError(f"{path.name}: line {line}: found no {name}, expected a finite number; fix line {line}")
+    return value

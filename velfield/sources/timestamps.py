@@ -1,13 +1,12 @@
 """Frame times from a CSV: ``frame,time_s``."""
 
-import math
 from pathlib import Path
 
 import numpy as np
 
 from schemas.arrays import FloatArray
 from velfield.errors import InputError
-from velfield.sources.table import read_csv_rows
+from velfield.sources.table import number_cell, read_csv_rows
 
 Times = dict[str, float]
 
@@ -28,17 +27,11 @@ def read_timestamps(path: Path) -> Times:
     times: Times = {}
     for line, row in read_csv_rows(path, required=("frame", "time_s"), what="time stamps"):
         name = row["frame"]
-        time_s = _number(row["time_s"])
-        if time_s is None:
-            raise InputError(
-                f"{path.name}: line {line}: found time_s {row['time_s']!r}, expected a finite number of seconds; fix "
-                f"line {line}"
-            )
         if name in times:
             raise InputError(
                 f"{path.name}: line {line}: found frame {name!r} a second time, expected each once; drop one"
             )
-        times[name] = time_s
+        times[name] = number_cell(path, line, row, "time_s")
     if not times:
         raise InputError(f"{path.name}: found no rows, expected one `frame,time_s` a frame; fill it, or give --fps")
     return times
@@ -72,11 +65,3 @@ def check_against_container(side_s: FloatArray, container_s: FloatArray, path: P
             f"{container_s[worst] - container_s[0]:.3f} s by the video's own times; omit --timestamps or "
             "fix it"
         )
-
-
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None

@@ -1,6 +1,7 @@
 """Telemetry of single images: EXIF, and XMP of DJI, Autel, Parrot, Skydio and others who write the same names."""
 
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
@@ -155,13 +156,31 @@ def _exif_camera(tags: dict[int, object]) -> dict[str, float]:
         found["focal_35mm"] = focal
     if zoom and zoom > 0:
         found["zoom"] = zoom
+    clock = parse_clock(*exif_time(tags))
+    return found if clock is None else {**found, "clock_s": clock[0]}
+
+
+def exif_time(tags: Mapping[int, object]) -> tuple[str, str]:
+    """When an image was taken by its EXIF, and the digits of the fraction of a second; empty where it has none."""
+    text, digits = (str(tags.get(tag, "")).strip("\0 ") for tag in (_TAKEN, _FRACTION))
+    return text, digits
+
+
+def parse_clock(text: str, digits: str) -> tuple[float, float] | None:
+    """A camera's clock, s since 1970 as if it were set to UTC, and its resolution, s; None where it is no time.
+
+    Examples
+    --------
+    >>> parse_clock("1970:01:01 00:01:00", "25"), parse_clock("", "")
+    ((60.25, 0.01), None)
+    """
     try:
-        taken = datetime.strptime(str(tags.get(_TAKEN)), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+        taken = datetime.strptime(text.replace("-", ":").replace("T", " "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
     except ValueError:
-        return found
-    fraction = str(tags.get(_FRACTION, "")).strip()
-    found["clock_s"] = taken.timestamp() + (int(fraction) / 10 ** len(fraction) if fraction.isdecimal() else 0.0)
-    return found
+        return None
+    if not digits.isdecimal():
+        return taken.timestamp(), 1.0
+    return taken.timestamp() + float(f"0.{digits}"), 10.0 ** -len(digits)
 
 
 def _degrees(value: object) -> float | None:

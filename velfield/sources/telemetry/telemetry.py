@@ -9,22 +9,6 @@ from schemas.arrays import FloatArray
 
 MAX_GAP_S = 5.0
 """A value is interpolated between records, and held beyond them, over no more than this."""
-QUANTITIES = (
-    "latitude_deg",
-    "longitude_deg",
-    "height_m",
-    "altitude_m",
-    "yaw_deg",
-    "pitch_deg",
-    "roll_deg",
-    "focal_35mm",
-    "focal_px",
-    "hfov_deg",
-    "vfov_deg",
-    "zoom",
-    "clock_s",
-)
-"""Quantities that a record may hold; `Telemetry` describes each."""
 _ANGLES = ("yaw_deg", "roll_deg")
 _LIMITS = {
     "latitude_deg": (-90.0, 90.0),
@@ -39,8 +23,11 @@ _LIMITS = {
     "hfov_deg": (0.2, 150.0),
     "vfov_deg": (0.2, 150.0),
     "zoom": (0.0, 200.0),
+    "clock_s": (-np.inf, np.inf),
 }
 """Range of valid values; others are in another unit, or wrong."""
+QUANTITIES = tuple(_LIMITS)
+"""Quantities that a record may hold; `Telemetry` describes each."""
 _E7 = 1e6
 _DOWN_RAD = 0.2
 

@@ -133,8 +133,7 @@ class _Reader:
         time_s, frame, times_note, more = self._times(fps)
         notes += more
         unit, axis, crs_wkt = self._unit(position), self._axis(position), None
-        xy, more = self._to_units(position, x, y, unit)
-        notes += more
+        xy = self._to_units(x, y, unit)
         if unit == "deg":
             xy, crs_wkt = _to_utm(self.path, x, y)
             xy[:, 1] *= -1
@@ -147,7 +146,7 @@ class _Reader:
         notes += more
         table = pd.DataFrame({"track_id": key[0], "source_id": key[1], "frame": frame, "time_s": time_s})
         table["x"], table["y"] = xy.T
-        sizes, more = self._sizes(position)
+        sizes, more = self._sizes()
         notes += more
         table = table.assign(**sizes)
         speed = self._speed()
@@ -216,14 +215,14 @@ class _Reader:
         small = max(float(np.ptp(x)), float(np.ptp(y))) < 1.0
         return replace(position, unit="deg", y_axis="up") if self.unit == "deg" or (inside and small) else position
 
-    def _to_units(self, position: Position, x: FloatArray, y: FloatArray, unit: Unit) -> tuple[FloatArray, list[str]]:
+    def _to_units(self, x: FloatArray, y: FloatArray, unit: Unit) -> FloatArray:
         xy = np.column_stack([x, y])
         if unit == "ft":
             xy *= FOOT_M
         if self.form is not None and self.form.point == "corner" and self.form.size is not None:
             width, height = (numbers(self.raw[self.columns[name]], self.path) for name in self.form.size[:2])
             xy += np.column_stack([width, height]) / 2
-        return xy, []
+        return xy
 
     def _against_degrees(self, position: Position, axis: YAxis, xy: FloatArray) -> tuple[YAxis, FloatArray, list[str]]:
         """The axis by the file's own degrees, where it has them too.
@@ -343,7 +342,7 @@ class _Reader:
 
     # sizes and speeds
 
-    def _sizes(self, position: Position) -> tuple[dict[str, FloatArray], list[str]]:
+    def _sizes(self) -> tuple[dict[str, FloatArray], list[str]]:
         listed = SIZES if self.form is None else (self.form.size,) if self.form.size else ()
         found: tuple[str, str | None, float] | None
         found = next((s for s in listed if s[0] in self.columns and s[1] in self.columns), None)

@@ -213,11 +213,7 @@ class CorruptionTracker:
 
     def mark_frame(self, index: int) -> None:
         """Register that the decoder marked frame `index` as corrupt."""
-        position = self._position.get(index)
-        self.last_error = self.last_error or "marked as corrupt by the decoder"
-        if position is not None:
-            count, group, _ = position
-            self._first_error[group] = min(count - MARGIN, self._first_error.get(group, count))
+        self._mark_at(index, "marked as corrupt by the decoder")
 
     def mark_artifacts(self, index: int) -> None:
         """Register block artefacts in frame `index`. On a key frame after corruption they are the repair."""
@@ -232,8 +228,11 @@ class CorruptionTracker:
 
     def mark_lost(self, index: int) -> None:
         """Register that a frame before frame `index` was lost: later frames may refer to it."""
+        self._mark_at(index, "a frame was lost")
+
+    def _mark_at(self, index: int, message: str) -> None:
         position = self._position.get(index)
-        self.last_error = self.last_error or "a frame was lost"
+        self.last_error = self.last_error or message
         if position is not None:
             count, group, _ = position
             self._first_error[group] = min(count - MARGIN, self._first_error.get(group, count))
