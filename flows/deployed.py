@@ -11,7 +11,7 @@ from flows.launch import prepare_process
 from flows.process_flight import run_flight
 from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig, read_runner
-from velfield.errors import InputError
+from velfield.errors import InputError, one_line
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.watch import find_image, inputs_of, newest_image, run_folders, run_name
 from velfield.run.layout import RunLayout, to_path
@@ -39,7 +39,7 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
         job = _dropped_job(Path(source), Path(runs))
         summary = run_flight(job, _runner(cluster), Console("quiet"))
     except Exception as error:  # in the terminal too: else nothing there follows "has arrived"
-        print_with_time(f"{Path(source).name} failed: {' '.join(str(error).split()) or type(error).__name__}")
+        print_with_time(f"{Path(source).name} failed: {one_line(error)}")
         raise
     for line in summary.frames_lost:
         get_run_logger().warning(line)

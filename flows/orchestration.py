@@ -11,7 +11,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from flows.runners import WorkersKilledError
-from schemas.job import absolute
 from schemas.summary import RunSummary
 from velfield.errors import InputError, is_disk_full
 from velfield.pipeline.plan import Plan
@@ -99,12 +98,3 @@ def worth_retrying(error: BaseException, attempts: int) -> bool:
     if isinstance(error, WorkersKilledError):
         return attempts <= 1
     return isinstance(error, Exception) and not isinstance(error, InputError) and not is_disk_full(error)
-
-
-def run_name(root: str) -> str:
-    """The name of a run: its folder, from the root on.
-
-    By a folder as it is given, two runs on a folder `RUN` of two places would be one, and one that was killed could
-    not be distinguished from one that lives.
-    """
-    return absolute(root)

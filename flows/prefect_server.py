@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flows.launch import spare_proxies
 from flows.orchestration import Orchestration, Threads
-from velfield.errors import InputError
+from velfield.errors import InputError, one_line
 
 _ANSWER_S = 5.0
 _NAMING_A_SERVER = ("PREFECT_API_URL", "PREFECT_PROFILE", "PREFECT_PROFILES_PATH")
@@ -92,7 +92,7 @@ def _no_answer(url: str, error: object) -> InputError:
     remove = "`unset PREFECT_API_URL`" if os.environ.get("PREFECT_API_URL") else in_settings
     return InputError(
         f"PREFECT_API_URL {url}: found no Prefect server that answers "
-        f"({' '.join(str(error).split()) or type(error).__name__}); start it, correct the address, or remove it "
+        f"({one_line(error)}); start it, correct the address, or remove it "
         f"({remove}): a run needs none"
     )
 

@@ -13,13 +13,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from flows.console import Console
-from flows.orchestration import Orchestration, run_name
+from flows.orchestration import Orchestration
 from flows.prefect_server import choose_orchestration
 from flows.previews import Previews
 from flows.runners import Runner, RunnerConfig, open_runner, parallel_units
 from flows.stopping import stop_lost
 from flows.work import Work
-from schemas.job import Job
+from schemas.job import Job, absolute
 from schemas.summary import RunSummary
 from velfield.errors import InputError
 from velfield.pipeline.check_inputs import validate_inputs
@@ -49,12 +49,16 @@ def run_flow(
     runner: RunnerConfig,
     console: Console,
 ) -> RunSummary:
-    """Run a flow of one job, named by its folder, with as many concurrent units as the runner can use."""
+    """Run a flow of one job with as many concurrent units as the runner can use.
+
+    It is named by its folder from the root on: by a folder as it is given, two runs on a folder `RUN` of two places
+    would be one, and one that was killed could not be distinguished from one that lives.
+    """
     by = choose_orchestration()
     return by.run(
         lambda: flow(job, runner, console, by),
         name=name,
-        run_name=run_name(job.root),
+        run_name=absolute(job.root),
         threads=parallel_units(runner),
         parameters=job,
     )
@@ -64,7 +68,7 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console, by: Orchest
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
     with locked(layout, stop_lost), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
-        by.mark_killed(run_name(job.root))
+        by.mark_killed(absolute(job.root))
         sweep_partial(layout.root)
         remove_tree(layout.preview)
         plan = make_plan(job)

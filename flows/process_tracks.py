@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from flows.console import Console
-from flows.orchestration import Orchestration, run_name
+from flows.orchestration import Orchestration
 from flows.process_flight import publish_report, record_start, run_flow
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stopping import stop_lost
 from flows.work import Work
-from schemas.job import Job
+from schemas.job import Job, absolute
 from schemas.summary import RunSummary
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
 from velfield.pipeline.graphs import tracks_graph
@@ -35,7 +35,7 @@ def process_tracks(job: Job, runner: RunnerConfig, console: Console, by: Orchest
     plan = plan_tracks(job)  # refuses bad tracks before the folder is there
     layout = RunLayout(Path(job.root))
     with locked(layout, stop_lost), open_runner(runner, console.warn) as where:
-        by.mark_killed(run_name(job.root))
+        by.mark_killed(absolute(job.root))
         sweep_partial(layout.root)
         record_start(plan, f"tracks over {plan.frame_count} times, {where.description}", console)
         work = Work(plan, where, console, by, at_once=parallel_units(runner))

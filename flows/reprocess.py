@@ -27,10 +27,9 @@ from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
 from velfield.pipeline.summary import summarise_run
 from velfield.run.commits import sweep_partial
 from velfield.run.flight_record import check_format
-from velfield.run.layout import RunLayout
+from velfield.run.layout import RunLayout, remove_tree, to_path
 from velfield.run.lock import locked
 from velfield.run.results import (
-    discard_result,
     link_shared_outputs,
     publish_result,
     result_exists,
@@ -96,7 +95,7 @@ def reprocess(
                 else _mapped(run, job, found, runner, console, by)
             )
         except InputError:
-            discard_result(RunLayout(Path(job.root)))
+            remove_tree(to_path(job.root))
             raise
         return publish_result(run, name, Path(base)), summary
 

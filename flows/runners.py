@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from pydantic import Field, PositiveInt, ValidationError
 
 from schemas.model import Model
-from velfield.errors import InputError
+from velfield.errors import InputError, one_line
 from velfield.parallel import usable_processors
 from velfield.pipeline.graphs import compute_here
 from velfield.pipeline.stage import load_kernels, load_stages
@@ -76,8 +76,7 @@ def read_runner(path: Path) -> RunnerConfig:
     except FileNotFoundError:
         raise InputError(f"--cluster {path}: no such file; the documentation has some, on its page Examples") from None
     except (yaml.YAMLError, ValidationError, ValueError, RecursionError) as error:
-        details = " ".join(str(error).split())
-        raise InputError(f"--cluster {path}: {details}; keys: cluster_class, cluster_kwargs, workers") from None
+        raise InputError(f"--cluster {path}: {one_line(error)}; keys: cluster_class, cluster_kwargs, workers") from None
     return RunnerConfig(**file.model_dump())
 
 
@@ -314,7 +313,7 @@ def check_scheduler(address: str) -> None:
     except TimeoutError:
         found = f"no answer within {_ANSWER_S:.0f} s"
     except Exception as error:  # of the address, of the name's look-up, of what another service answers
-        found = " ".join(str(error).split()) or type(error).__name__
+        found = one_line(error)
     if found != "Scheduler":
         raise InputError(f"--scheduler {address}: no Dask scheduler there ({found}); {expected}")
 

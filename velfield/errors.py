@@ -54,6 +54,17 @@ def is_disk_full(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _FULL
 
 
+def one_line(error: object) -> str:
+    """An error of a library, or its message, in one line of at most 160 characters; its kind where it is empty.
+
+    Examples
+    --------
+    >>> one_line(ValueError("two\\n   lines")), one_line(TimeoutError())
+    ('two lines', 'TimeoutError')
+    """
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
 def parse_json(data: str | bytes) -> Any:
     """Parse JSON from an untrusted file.
 

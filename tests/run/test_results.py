@@ -13,7 +13,6 @@ from velfield.errors import InputError
 from velfield.run.commits import digest_path, read_commit, valid_commit, write_commit
 from velfield.run.layout import RunLayout
 from velfield.run.results import (
-    discard_result,
     final_root,
     link_shared_outputs,
     publish_result,
@@ -125,11 +124,3 @@ def test_a_unit_that_the_new_result_has_is_not_linked_again(run: Run) -> None:
     commit(old, "frames", "00000", "frames.zarr/c/0", key="another")
     link_shared_outputs(old, new, ("frames",))
     assert os.path.samefile(old.root / "frames.zarr/c/0", new.root / "frames.zarr/c/0")
-
-
-def test_a_discarded_result_leaves_the_others_alone(run: Run) -> None:
-    staged = staging_layout(run.layout, "spring")
-    commit(staged, "frames", "00000", "frames.zarr/c/0")
-    discard_result(staged)
-    assert not staged.root.exists()
-    assert run.layout.flight.exists()

@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from schemas.records import FORMAT_VERSION, FlightRecord
-from velfield.errors import InputError
+from velfield.errors import InputError, one_line
 from velfield.run.commits import read_sealed
 from velfield.run.layout import RunLayout, check_store, is_remote
 
@@ -81,7 +81,7 @@ def _parse(path: Path) -> dict[str, Any]:
         return read_sealed(path.read_bytes())
     except ValueError as error:
         raise InputError(
-            f"{path} is damaged ({' '.join(str(error).split())}), expected the record that `velfield run` wrote; the "
+            f"{path} is damaged ({one_line(error)}), expected the record that `velfield run` wrote; the "
             "same `velfield run` command writes it again and keeps what is finished"
         ) from None
 

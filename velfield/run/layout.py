@@ -107,18 +107,6 @@ def local_copy(path: Path) -> Iterator[Path]:
         yield local
 
 
-@contextmanager
-def local_output(path: Path) -> Iterator[Path]:
-    """A file that libraries can write by name; at the end of the context the object is written from it, whole."""
-    if not is_remote(path):
-        yield path
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        local = Path(folder) / path.name
-        yield local
-        path.write_bytes(local.read_bytes())
-
-
 class _Inside:
     """A path of a run folder, from its root."""
 

@@ -113,11 +113,6 @@ def link_shared_outputs(
             write_commit(new, kept)
 
 
-def discard_result(layout: RunLayout) -> None:
-    """Remove an unfinished result."""
-    remove_tree(layout.root)
-
-
 def publish_result(run: Run, name: str, base: Path) -> Path:
     """Rename a complete result to its name, and list both in ``results.json``."""
     layout = run.layout

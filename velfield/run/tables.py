@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.tables import TRACK_COLUMNS
-from velfield.errors import StoreError
+from velfield.errors import StoreError, one_line
 from velfield.run.commits import open_atomically, write_atomically
 from velfield.run.layout import copy_objects, is_remote
 
@@ -107,7 +107,7 @@ def _read_part(path: Path, columns: list[str]) -> pd.DataFrame:
 
 
 def _damage_error(path: Path, error: Exception) -> StoreError:
-    return StoreError(f"{path} is damaged ({' '.join(str(error).split())[:100]}); `velfield verify` finds its unit")
+    return StoreError(f"{path} is damaged ({one_line(error)}); `velfield verify` finds its unit")
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any] | Sequence[NDArray[Any]]]) -> None:

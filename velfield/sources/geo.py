@@ -1,7 +1,8 @@
 """The base image and its georeference: read safely, reprojected from degrees, its ground sample distance measured."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,11 @@ from rasterio.warp import Resampling, reproject, transform
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.flight import FramesConfig
-from velfield.errors import InputError
+from velfield.errors import InputError, one_line
 from velfield.sources.frames import local_path
 from velfield.sources.images import check_size, read_grey_image
 
-_DRIVERS = ((b"II*\0", "GTiff"), (b"MM\0*", "GTiff"), (b"II+\0", "GTiff"), (b"MM\0+", "GTiff"))
+TIFF_DRIVERS = ((b"II*\0", "GTiff"), (b"MM\0*", "GTiff"), (b"II+\0", "GTiff"), (b"MM\0+", "GTiff"))
 _PICTURE_DRIVERS = ((b"\x89PNG", "PNG"), (b"\xff\xd8\xff", "JPEG"), (b"BM", "BMP"))
 _WGS84_A_M, _WGS84_E2 = 6378137.0, 0.00669437999014
 _SQUARE = 0.02
@@ -73,7 +74,7 @@ def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
     """
     file = local_path(path, "base image")
     head = _read_magic(file)
-    driver = next((name for magic, name in _DRIVERS if head.startswith(magic)), None)
+    driver = next((name for magic, name in TIFF_DRIVERS if head.startswith(magic)), None)
     if driver is not None:
         raster = _read_geotiff(file, config.max_pixels)
     else:
@@ -119,7 +120,7 @@ def _to_degrees(crs: CRS, xs: Sequence[float], ys: Sequence[float], name: str) -
         longitude, latitude = (np.asarray(values) for values in transform(crs, CRS.from_epsg(4326), xs, ys))
         reason = "" if np.isfinite([longitude, latitude]).all() else "coordinates beyond its area"
     except (CPLE_BaseError, RasterioError) as error:
-        reason = _one_line(error)
+        reason = one_line(error)
     if reason:
         raise InputError(
             f"{name}: found a reference system that does not cover the image ({reason}), expected one that does; fix it"
@@ -193,6 +194,18 @@ def _to_base_raster(path: Path, raster: _Raster, max_pixels: int) -> BaseRaster:
     )
 
 
+@contextmanager
+def ignore_missing_georeference() -> Iterator[None]:
+    """Without a warning that an image is not georeferenced, as many are not.
+
+    Filters of warnings belong to the whole process: where one of several threads writes images, enter this
+    before they start, or another that leaves `warnings.catch_warnings` meanwhile takes it back.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        yield
+
+
 def _read_magic(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
@@ -206,8 +219,7 @@ def _read_magic(path: Path) -> bytes:
 def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
     """Read with GDAL's GTiff driver alone: a VRT named .tif would read other files."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with ignore_missing_georeference():
             dataset = rasterio.open(path, driver="GTiff")
         with dataset:
             check_size(path, dataset.width, dataset.height, max_pixels)
@@ -215,7 +227,7 @@ def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
             grey, valid = _grey_levels(path, dataset)
     except RasterioError as error:
         raise InputError(
-            f"{path.name}: the TIFF is truncated or damaged ({_one_line(error)}), expected a whole one"
+            f"{path.name}: the TIFF is truncated or damaged ({one_line(error)}), expected a whole one"
         ) from None
     return _with_georeference(path, _Raster(grey, valid), crs, affine, points)
 
@@ -292,12 +304,10 @@ def _read_beside(path: Path, grey: GreyImage, head: bytes) -> _Raster:
     if driver is None:
         return raster
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, driver=driver) as dataset:
-                crs, affine, points = dataset.crs, dataset.transform, len(dataset.gcps[0])
+        with ignore_missing_georeference(), rasterio.open(path, driver=driver) as dataset:
+            crs, affine, points = dataset.crs, dataset.transform, len(dataset.gcps[0])
     except RasterioError as error:
-        return replace(raster, notes=(f"its reference could not be read: {_one_line(error)}",))
+        return replace(raster, notes=(f"its reference could not be read: {one_line(error)}",))
     return _with_georeference(path, raster, crs, affine, points)
 
 
@@ -309,7 +319,7 @@ def _prj(path: Path) -> CRS | None:
         return CRS.from_user_input(beside.read_text(encoding="utf-8", errors="replace").strip()[:100_000])
     except (CRSError, OSError) as error:
         raise InputError(
-            f"{beside.name}: found no reference system ({_one_line(error)}), expected WKT; fix or remove it"
+            f"{beside.name}: found no reference system ({one_line(error)}), expected WKT; fix or remove it"
         ) from None
 
 
@@ -372,7 +382,3 @@ def _ground_distance(longitude: FloatArray, latitude: FloatArray) -> float:
     difference = (longitude[1] - longitude[0] + np.pi) % (2 * np.pi) - np.pi
     east = _WGS84_A_M / np.sqrt(flat) * np.cos(middle) * difference
     return float(np.hypot(north, east))
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:160]

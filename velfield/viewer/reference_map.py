@@ -7,7 +7,6 @@ a server. Nothing but the file is read: formats that name other files or address
 import math
 import re
 import threading
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,15 @@ from numpy.typing import NDArray
 from rasterio._err import CPLE_BaseError  # what PROJ refuses; rasterio's public errors have none for it
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
-from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
+from rasterio.errors import CRSError, RasterioError
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import Resampling, transform, transform_bounds
 from rasterio.windows import Window
 
 from schemas.arrays import FloatArray, GreyImage
-from velfield.errors import InputError
+from velfield.errors import InputError, one_line
 from velfield.sources.frames import local_path
+from velfield.sources.geo import TIFF_DRIVERS, ignore_missing_georeference
 
 TILE_PX = 256
 MAX_ZOOM = 24
@@ -34,13 +34,7 @@ _HALF_WORLD_M = math.pi * 6378137.0
 _WEB_MERCATOR, _DEGREES = CRS.from_epsg(3857), CRS.from_epsg(4326)
 _MAX_LATITUDE = 85.05
 _NO_TRANSFORM = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-_DRIVERS = (
-    (b"II*\0", "GTiff"),
-    (b"MM\0*", "GTiff"),
-    (b"II+\0", "GTiff"),
-    (b"MM\0+", "GTiff"),
-    (b"SQLite format 3\0", "MBTiles"),
-)
+_DRIVERS = (*TIFF_DRIVERS, (b"SQLite format 3\0", "MBTiles"))
 _MAX_PX_WITHOUT_OVERVIEWS = 1e8
 """All of them are read for the first view: some seconds."""
 _SAMPLE_PX = 512
@@ -102,18 +96,17 @@ class ReferenceMap:
         self._alone = threading.Lock()
         driver = _driver(file)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with ignore_missing_georeference():
                 self._source = rasterio.open(file, driver=driver)
         except RasterioError as error:
-            raise InputError(f"--map {file.name}: could not be read ({_one_line(error)}), {_EXPECTED}") from None
+            raise InputError(f"--map {file.name}: could not be read ({one_line(error)}), {_EXPECTED}") from None
         try:
             self.bounds = self._check()
             self._bands, self._levels = self._read_levels()
             self._warped = self._warp()
         except (RasterioError, CPLE_BaseError) as error:
             self.close()
-            raise InputError(f"--map {file.name}: could not be read ({_one_line(error)}), {_EXPECTED}") from None
+            raise InputError(f"--map {file.name}: could not be read ({one_line(error)}), {_EXPECTED}") from None
         except InputError:
             self.close()
             raise
@@ -155,7 +148,7 @@ class ReferenceMap:
             colours = self._read(window, shape)
         except RasterioError as error:
             raise InputError(
-                f"--map {self.name}: the tile {zoom}/{column}/{row} could not be read ({_one_line(error)}), expected a "
+                f"--map {self.name}: the tile {zoom}/{column}/{row} could not be read ({one_line(error)}), expected a "
                 "whole file; copy it again"
             ) from None
         tile[rows[0] : rows[1], columns[0] : columns[1]] = colours
@@ -338,7 +331,3 @@ def _crs(epsg: int) -> CRS:
         return CRS.from_epsg(epsg)
     except CRSError:
         raise InputError(f"EPSG code {epsg}: found no such reference system, expected one such as 32633") from None
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:160]

@@ -1,13 +1,10 @@
 """Cloud-optimised GeoTIFF: layers of the field for GIS, with names, units, NaN and the reference system."""
 
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning
 from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 from rasterio.transform import Affine
@@ -16,6 +13,7 @@ from schemas.export import ExportOptions
 from velfield.run.commits import write_atomically
 from velfield.run.run import Run
 from velfield.run.stores import open_field
+from velfield.sources.geo import ignore_missing_georeference
 
 FILE_NAME = "field.tif"
 AffineCoefficients = tuple[float, float, float, float, float, float]
@@ -47,18 +45,6 @@ def write_cog(
 ) -> None:
     """Write a cloud-optimised GeoTIFF, whole or not at all: see `cog_bytes`."""
     write_atomically(path, cog_bytes(layers, names=names, units=units, crs_wkt=crs_wkt, affine=affine))
-
-
-@contextmanager
-def ignore_missing_georeference() -> Iterator[None]:
-    """Without a warning that an image is not georeferenced, as many are not.
-
-    Filters of warnings belong to the whole process: where one of several threads writes images, enter this
-    before they start, or another that leaves `warnings.catch_warnings` meanwhile takes it back.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        yield
 
 
 def cog_bytes(

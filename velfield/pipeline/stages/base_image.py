@@ -32,7 +32,7 @@ from velfield.registration.own_base import DetectKeypoints, OwnBase, build_own_b
 from velfield.report.figures import png_bytes
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import base_mesh_to_record, read_lens
-from velfield.run.layout import RunLayout, local_output
+from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.sources.geo import BaseRaster, reconcile_gsd
 
@@ -251,9 +251,9 @@ def write_given_image(layout: RunLayout, given: BaseRaster) -> list[Path]:
     for before in (layout.base_image, layout.base_image_tif):
         before.unlink(missing_ok=True)
     if given.crs_wkt is not None and given.affine is not None:
-        with local_output(layout.base_image_tif) as here:
-            write_cog(here, [given.grey], names=["grey"], units=["1"], crs_wkt=given.crs_wkt, affine=given.affine)
-        return [layout.base_image_tif]
+        path = layout.base_image_tif
+        write_cog(path, [given.grey], names=["grey"], units=["1"], crs_wkt=given.crs_wkt, affine=given.affine)
+        return [path]
     write_atomically(layout.base_image, png_bytes(given.grey))
     return [layout.base_image]
 

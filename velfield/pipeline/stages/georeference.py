@@ -28,7 +28,7 @@ from velfield.run.frame_transforms import (
     read_base_image,
     read_own_grid,
 )
-from velfield.run.layout import RunLayout, local_output
+from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames, open_registration
 from velfield.sources.capture_times import read_flight_start
 from velfield.sources.clips import read_clips_telemetry
@@ -274,9 +274,8 @@ def write_georeference(layout: RunLayout, path: Path, record: GeoreferenceRecord
         layout.base_image_tif.unlink(missing_ok=True)
         grey = read_base_image(layout, frames)
         if record.crs_wkt is not None and record.affine is not None:
-            with local_output(layout.base_image_tif) as here:
-                write_cog(here, [grey], names=["grey"], units=["1"], crs_wkt=record.crs_wkt, affine=record.affine)
             outputs.append(layout.base_image_tif)
+            write_cog(outputs[-1], [grey], names=["grey"], units=["1"], crs_wkt=record.crs_wkt, affine=record.affine)
     write_atomically(path, record.model_dump_json(indent=1).encode())
     return outputs
 

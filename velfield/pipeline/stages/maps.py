@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, Mask
-from velfield.exports.gis.cog import ignore_missing_georeference, write_cog
+from velfield.exports.gis.cog import write_cog
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
 from velfield.parallel import parallel_map
@@ -19,8 +19,8 @@ from velfield.report.figures import MapScale, direction_figure, png_bytes, speed
 from velfield.report.quality_figures import registration_error_figure, undistortion_figure
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import heading_deg, north_direction_rad, read_base_image, read_grid, read_lens
-from velfield.run.layout import local_output
 from velfield.run.stores import open_field, open_frames, open_registration
+from velfield.sources.geo import ignore_missing_georeference
 from velfield.viewer.record import write_view_data
 
 PREVIEW_SIDE_PX = 900
@@ -95,8 +95,7 @@ def _write_figure(plan: Plan, name: str, figure: NDArray[np.uint8]) -> list[Path
 
 def _write_layer(plan: Plan, name: str, values: NDArray[np.floating], label: str, unit: str) -> Path:
     grid, path = read_grid(plan.layout), plan.layout.maps / f"{name}.tif"
-    with local_output(path) as here:
-        write_cog(here, [values], names=[label], units=[unit], crs_wkt=grid.crs_wkt, affine=grid.affine)
+    write_cog(path, [values], names=[label], units=[unit], crs_wkt=grid.crs_wkt, affine=grid.affine)
     return path
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import FloatArray
-from velfield.errors import InputError
+from velfield.errors import InputError, one_line
 from velfield.sources.tracks.formats import MOT_COLUMNS, normal_name
 
 _SEPARATORS = (";", "\t", "|", ",")
@@ -103,7 +103,7 @@ def _read_bytes(path: Path) -> bytes:
         data = path.read_bytes()
         return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: could not be read ({' '.join(str(error).split())[:160]}); copy it again") from None
+        raise InputError(f"{path}: could not be read ({one_line(error)}); copy it again") from None
 
 
 def _decode(path: Path, data: bytes) -> str:
@@ -123,8 +123,9 @@ def _read_parquet(path: Path, data: bytes) -> pd.DataFrame:
     try:
         return pd.read_parquet(io.BytesIO(data)).reset_index(drop=True)
     except Exception as error:  # pyarrow's own kinds, some of which are OSError
-        what = " ".join(str(error).split())[:160]
-        raise InputError(f"{path}: this is no Parquet file that can be read ({what}); write it again") from None
+        raise InputError(
+            f"{path}: this is no Parquet file that can be read ({one_line(error)}); write it again"
+        ) from None
 
 
 def _read_csv(path: Path, text: str) -> pd.DataFrame:
@@ -174,8 +175,7 @@ def _read_csv(path: Path, text: str) -> pd.DataFrame:
             keep_default_na=True,
         )
     except (ValueError, pd.errors.ParserError, csv.Error) as error:
-        what = " ".join(str(error).split())[:160]
-        raise InputError(f"{path}: no table of tracks ({what}); expected a {EXPECTED}") from None
+        raise InputError(f"{path}: no table of tracks ({one_line(error)}); expected a {EXPECTED}") from None
     return table.dropna(how="all", ignore_index=True)
 
 
