@@ -332,3 +332,12 @@ def _tile_range(a: FloatArray, b: FloatArray, reach: float, length: int, tile_si
     first = low.astype(np.int64) // tile_size
     last = np.where(outside, first - 1, high.astype(np.int64) // tile_size)
     return first, last
+
+
+def tracks_in(table: pd.DataFrame, low_xy: tuple[float, float], high_xy: tuple[float, float]) -> IntArray:
+    """Tracks of the tracklets (`TRACKLET_COLUMNS`) whose bounding box meets a rectangle."""
+    inside = np.ones(len(table), bool)
+    for axis, low, high in zip("xy", low_xy, high_xy, strict=True):
+        positions = table[[f"{axis}_{k}_px" for k in range(3)]].to_numpy()
+        inside &= (positions.max(axis=1, initial=-np.inf) >= low) & (positions.min(axis=1, initial=np.inf) <= high)
+    return np.unique(table["track_id"].to_numpy(np.int64)[inside])

@@ -10,7 +10,7 @@ from schemas.arrays import Mask
 from schemas.records import CommitRecord, RebaseRecord
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
-from velfield.field.segments import SEGMENT_DTYPE, Segments, VelocityBins, band_radius_px, segment_table
+from velfield.field.segments import SEGMENT_DTYPE, Segments, VelocityBins, band_radius_px, segment_table, tracks_in
 from velfield.run.commits import read_commits
 from velfield.run.frame_transforms import read_working
 from velfield.run.run import Run
@@ -82,18 +82,11 @@ def pixel_lineage(run: Run, x: int, y: int) -> PixelLineage:
         raise InputError(f"pixel ({x}, {y}) is outside the base image of {width} x {height} px")
     tracklets = run.tracklets()
     margin_px = (band_radius_px(run.record.config.field, run.grid.gsd_m) or 0.0) + 1.0
-    touching = _touching(run, _near(tracklets, x, y, margin_px), x, y)
+    # All tracklets of the tracks that come near: a shared segment's velocity is averaged along its track.
+    near = tracks_in(tracklets, (x - margin_px, y - margin_px), (x + margin_px, y + margin_px))
+    touching = _touching(run, tracklets[tracklets["track_id"].isin(near)], x, y)
     tracks = tuple(_tracks(tracklets, touching))
     return PixelLineage(x, y, tracks, _frames(run, sorted({f for track in tracks for f in track.frames})))
-
-
-def _near(tracklets: pd.DataFrame, x: int, y: int, margin_px: float) -> pd.DataFrame:
-    """All tracklets of the tracks that come near: a shared segment's velocity is averaged along its track."""
-    xs = tracklets[[f"x_{k}_px" for k in range(3)]].to_numpy()
-    ys = tracklets[[f"y_{k}_px" for k in range(3)]].to_numpy()
-    across = (xs.min(axis=1, initial=np.inf) - margin_px <= x) & (x <= xs.max(axis=1, initial=-np.inf) + margin_px)
-    down = (ys.min(axis=1, initial=np.inf) - margin_px <= y) & (y <= ys.max(axis=1, initial=-np.inf) + margin_px)
-    return tracklets[tracklets["track_id"].isin(tracklets.loc[across & down, "track_id"])]
 
 
 def _touching(run: Run, tracklets: pd.DataFrame, x: int, y: int) -> Segments:

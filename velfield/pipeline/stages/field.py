@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import IntArray
 from schemas.flight import FieldConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.accumulate import Weight, accumulate_tile
@@ -20,6 +19,7 @@ from velfield.field.segments import (
     band_radius_px,
     segment_table,
     segments_by_tile,
+    tracks_in,
 )
 from velfield.field.time_intervals import TimeInterval, assign_intervals
 from velfield.pipeline.plan import Plan
@@ -150,18 +150,9 @@ def _tracklets_near(plan: Plan, low_xy: tuple[float, float], high_xy: tuple[floa
     read = partial(read_tables, columns=TRACKLET_COLUMNS)
     if not paths:
         return read([], only=list(SEGMENT_COLUMNS))
-    near = np.unique(np.concatenate([_tracks_in(read([path], only=_PLACE_COLUMNS), low_xy, high_xy) for path in paths]))
+    near = np.unique(np.concatenate([tracks_in(read([path], only=_PLACE_COLUMNS), low_xy, high_xy) for path in paths]))
     parts = []
     for path in paths:
         table = read([path], only=list(SEGMENT_COLUMNS))
         parts.append(table[np.isin(table["track_id"].to_numpy(), near)])
     return pd.concat(parts, ignore_index=True)
-
-
-def _tracks_in(table: pd.DataFrame, low_xy: tuple[float, float], high_xy: tuple[float, float]) -> IntArray:
-    """Tracks of the tracklets whose bounding box meets the rectangle."""
-    inside = np.ones(len(table), bool)
-    for axis, low, high in zip("xy", low_xy, high_xy, strict=True):
-        positions = table[[f"{axis}_{k}_px" for k in range(3)]].to_numpy()
-        inside &= (positions.max(axis=1, initial=-np.inf) >= low) & (positions.min(axis=1, initial=np.inf) <= high)
-    return np.unique(table["track_id"].to_numpy(np.int64)[inside])
