@@ -44,9 +44,9 @@ class RunAnalysis:
     grid, config
         Base pixels and configuration of the field.
     dimensions
-        Returns the dimensions of the vehicles (`schemas.tables.DIMENSION_COLUMNS`); None: they were not measured.
+        Returns the dimensions of the vehicles (`schemas.tables.DIMENSION_COLUMNS`).
     vehicles
-        Returns the vehicles (`velfield.run.run.Run.vehicles`), of which some are parked; None: not known.
+        Returns the vehicles (`velfield.run.run.Run.vehicles`), of which some are parked.
     position_sd_m
         Standard deviation of a position along one axis, of tracks of another program.
     frame_times
@@ -57,26 +57,24 @@ class RunAnalysis:
     tracklets: Callable[[], pd.DataFrame]
     grid: GridRecord
     config: FieldConfig
-    dimensions: Callable[[], pd.DataFrame] | None = None
-    vehicles: Callable[[], pd.DataFrame] | None = None
-    position_sd_m: float = 0.0
-    frame_times: Callable[[], FloatArray] | None = None
+    dimensions: Callable[[], pd.DataFrame]
+    vehicles: Callable[[], pd.DataFrame]
+    position_sd_m: float
+    frame_times: Callable[[], FloatArray] | None
 
     @cached_property
     def trajectories(self) -> Trajectories:
         """Tracks of vehicles that move, in metres."""
         made = from_tracklets(self.tracklets(), self.gsd_m)
-        trajectories = moving(replace(made, position_sd_m=self.position_sd_m, gaps_s=self._gaps_s))
-        return trajectories if self.dimensions is None else trajectories.with_lengths(self.dimensions())
+        known = replace(made, position_sd_m=self.position_sd_m, gaps_s=self._gaps_s)
+        return moving(known).with_lengths(self.dimensions())
 
     @cached_property
     def traffic(self) -> TrafficAnalysis:
         """Answers about lanes, movements, speeds, signals, flow and conflicts: what `velfield analyse` writes."""
-        parked = None
-        if self.vehicles is not None:
-            known = self.vehicles()
-            columns = known.loc[known["state"] == "parked", ["x_px", "y_px", "orientation_rad"]]
-            parked = columns.to_numpy(np.float64) * [self.gsd_m, self.gsd_m, 1.0]
+        known = self.vehicles()
+        columns = known.loc[known["state"] == "parked", ["x_px", "y_px", "orientation_rad"]]
+        parked = columns.to_numpy(np.float64) * [self.gsd_m, self.gsd_m, 1.0]
         names = ArmNames(north_direction_rad(self.grid))
         return TrafficAnalysis(self.trajectories, parked=parked, classes=self._classes, arm_names=names)
 
@@ -91,8 +89,8 @@ class RunAnalysis:
 
     @property
     def _classes(self) -> VehicleClasses | None:
-        """Classes of the vehicles that move; None where nothing gives their dimensions in metres."""
-        if self.dimensions is None or self.grid.gsd_m is None:
+        """Classes of the vehicles that move; None where the ground sample distance is not known."""
+        if self.grid.gsd_m is None:
             return None
         table = self.dimensions().set_index("track_id").reindex(self.trajectories.track_id) * self.grid.gsd_m
         size, sd = (table[[f"length{k}_px", f"width{k}_px"]].to_numpy(np.float64) for k in ("", "_sd"))

@@ -61,11 +61,6 @@ class WorkingGrid:
         maps = FrameTransforms.open(plan.layout, plan.config)
         return cls(open_frames(plan.layout.frames), maps, read_grid(plan.layout), scale)
 
-    @property
-    def whole(self) -> Window:
-        """The whole base image."""
-        return 0, 0, self.grid.width_px, self.grid.height_px
-
     def frame(self, frame: int, window: Window | None = None) -> WorkingFrame | None:
         """One frame; none where it is not registered or does not meet the base image. ``window`` none: its
         footprint."""
