@@ -1,6 +1,6 @@
 """Tables of answers (`schemas.analysis.AnalysisTable`) of columns: each once, with its key, title, unit and value."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
@@ -16,6 +16,7 @@ from velfield.pipeline.analysis.lanes_record import points_px
 
 KM_PER_H = 3.6
 T = TypeVar("T")
+Value = bool | int | float | str | None
 
 
 @dataclass(frozen=True)
@@ -118,17 +119,23 @@ def data_frame(table: AnalysisTable) -> pd.DataFrame:
     >>> data_frame(AnalysisTable(name="speed", section="", title="", columns=(speed,), rows=rows)).columns.tolist()
     ['p50_km_per_h', 'p50_low_km_per_h', 'p50_high_km_per_h', 'p50_n']
     """
-    out: dict[str, list[object]] = {}
+    out: dict[str, list[Value]] = {}
+    for column, part, values in flat_columns(table):
+        unit = column.unit.replace("/", "_per_").replace("%", "percent").replace(" ", "_")
+        words = (column.name, "" if part == "value" else part, "" if part == "n" else unit)
+        out["_".join(word for word in words if word)] = values
+    return pd.DataFrame(out)
+
+
+def flat_columns(table: AnalysisTable) -> Iterator[tuple[AnalysisColumn, str, list[Value]]]:
+    """Columns with their values, those of estimates in four parts: ``value``, ``low``, ``high`` and ``n``."""
     for column in table.columns:
         cells = [row.cells.get(column.name) for row in table.rows]
-        unit = column.unit.replace("/", "_per_").replace("%", "percent").replace(" ", "_")
-        suffix = f"_{unit}" if unit else ""
         if any(isinstance(cell, EstimateRecord) for cell in cells):
-            for part, name in (("value", suffix), ("low", f"_low{suffix}"), ("high", f"_high{suffix}"), ("n", "_n")):
-                out[column.name + name] = [getattr(cell, part, None) for cell in cells]
+            for part in ("value", "low", "high", "n"):
+                yield column, part, [getattr(cell, part, None) for cell in cells]
         else:
-            out[column.name + suffix] = list(cells)
-    return pd.DataFrame(out)
+            yield column, "value", [None if isinstance(cell, EstimateRecord) else cell for cell in cells]
 
 
 def estimate_cell(estimate: Estimate | None, factor: float = 1.0) -> EstimateRecord:

@@ -1,10 +1,14 @@
 """The tables as an Excel workbook: a sheet a table, an estimate in four columns."""
 
 import io
+from collections.abc import Iterator, Sequence
 
 import xlsxwriter
 
-from schemas.analysis import AnalysisRecord, AnalysisTable, EstimateRecord
+from schemas.analysis import AnalysisRecord, AnalysisTable
+from velfield.pipeline.analysis.cells import Value, flat_columns
+
+_PARTS = {"low": "90 % from", "high": "to", "n": "n"}
 
 
 def workbook_bytes(record: AnalysisRecord) -> bytes:
@@ -16,42 +20,22 @@ def workbook_bytes(record: AnalysisRecord) -> bytes:
         sheet = book.add_worksheet(table.name[:31])
         sheet.write(0, 0, table.title, bold)
         sheet.write(1, 0, table.note, wrapped)
-        for column, title in enumerate(_titles(table)):
-            sheet.write(3, column, title, bold)
-        for k, values in enumerate(_values(table)):
-            for column, value in enumerate(values):
+        for k, (title, values) in enumerate(_columns(table)):
+            sheet.write(3, k, title, bold)
+            for row, value in enumerate(values, start=4):
                 if value is not None:
-                    sheet.write(4 + k, column, value)
+                    sheet.write(row, k, value)
         sheet.freeze_panes(4, 1)
         sheet.set_column(0, 40, 14)
     book.close()
     return buffer.getvalue()
 
 
-def _estimates(table: AnalysisTable) -> set[str]:
-    """Names of the columns that hold estimates."""
-    return {name for row in table.rows for name, cell in row.cells.items() if isinstance(cell, EstimateRecord)}
-
-
-def _titles(table: AnalysisTable) -> list[str]:
-    titles = []
-    for column in table.columns:
+def _columns(table: AnalysisTable) -> Iterator[tuple[str, Sequence[Value]]]:
+    """Titles and values; last, where each row is on the map."""
+    for column, part, values in flat_columns(table):
         title = f"{column.title}, {column.unit}" if column.unit else column.title
-        titles += [title, "90 % from", "to", "n"] if column.name in _estimates(table) else [title]
-    return [*titles, "x, px", "y, px"]
-
-
-def _values(table: AnalysisTable) -> list[list[str | float | int | None]]:
-    estimates, out = _estimates(table), []
-    for row in table.rows:
-        values: list[str | float | int | None] = []
-        for column in table.columns:
-            cell = row.cells.get(column.name)
-            if column.name in estimates:
-                known = cell if isinstance(cell, EstimateRecord) else EstimateRecord()
-                values += [known.value, known.low, known.high, known.n or None]
-            else:
-                values.append(cell if not isinstance(cell, EstimateRecord) else None)
-        at = row.geometry.xy_px[0] if row.geometry else (None, None)
-        out.append([*values, *at])
-    return out
+        yield _PARTS.get(part, title), [None if part == "n" and not value else value for value in values]
+    places = [row.geometry.xy_px[0] if row.geometry else (None, None) for row in table.rows]
+    yield "x, px", [x for x, _ in places]
+    yield "y, px", [y for _, y in places]
