@@ -1,9 +1,8 @@
 """``velfield annotate``: label cars by click and drag, as training data."""
 
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
+from flows.options import OpenBrowser, Port
 
 
 def annotate(
@@ -12,8 +11,8 @@ def annotate(
     *,
     labels: Path | None = None,
     frames: int = 12,
-    port: int | None = None,
-    open_browser: Annotated[bool, Parameter(name="--open")] = True,
+    port: Port = None,
+    open_browser: OpenBrowser = True,
 ) -> int:
     """Label cars in the browser by dragging along each; the file is for `velfield run --labels`.
 
@@ -26,10 +25,6 @@ def annotate(
         Default: `labels.csv` in the run folder, or next to the image.
     frames
         Number of frames of a run to show.
-    port
-        Port to listen on. Default: any free port.
-    open_browser
-        Open the browser, if there is a screen.
     """
     from flows.commands.view import serve_until_interrupted
     from velfield.viewer.annotations import frames_to_annotate

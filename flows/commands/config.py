@@ -1,21 +1,15 @@
 """``velfield config``: the configuration of a run."""
 
-from pathlib import Path
-
 from cyclopts import App
+
+from flows.options import RunFolder
 
 config = App(name="config", help="Print the configuration of a run.")
 
 
 @config.command
-def show(run_folder: Path, /) -> int:
-    """Print the resolved configuration of a run as YAML; `velfield run ... --config FILE` reads it back.
-
-    Parameters
-    ----------
-    run_folder
-        The run folder.
-    """
+def show(run_folder: RunFolder, /) -> int:
+    """Print the resolved configuration of a run as YAML; `velfield run ... --config FILE` reads it back."""
     import yaml
 
     from velfield.run.run import open_run

@@ -4,15 +4,15 @@ import shlex
 from pathlib import Path
 
 from flows.commands.start import own_command
-from flows.options import DONE, INCOMPLETE, Quiet
+from flows.options import DONE, INCOMPLETE, FrameSize, Quiet, Seed
 
 
 def demo(
     *,
     out: Path = Path("velfield-demo"),
     frames: int = 120,
-    size: str = "800x600",
-    seed: int = 1,
+    size: FrameSize = "800x600",
+    seed: Seed = 1,
     quiet: Quiet = False,
 ) -> int:
     """Simulate a drone clip, process it with nothing else given, analyse it, and compare it with its ground truth.
@@ -23,12 +23,6 @@ def demo(
         Folder to write to.
     frames
         Number of frames.
-    size
-        Frame size, WxH in pixels.
-    seed
-        Seed of the city and the flight.
-    quiet
-        Print warnings only.
     """
     from flows.commands.analyse import analyse
     from flows.commands.run import process

@@ -6,13 +6,14 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from flows.options import RunFolder
 from schemas.export import EXPORT_FORMATS, ExportFormat, ExportOptions, SpeedUnit
 
 _FORMATS_HELP = "; ".join(f"`{name}`: {content}" for name, content in EXPORT_FORMATS.items()) + "."
 
 
 def export(
-    run_folder: Path,
+    run_folder: RunFolder,
     /,
     *,
     format_name: Annotated[ExportFormat, Parameter(name="--format", help=_FORMATS_HELP)],
@@ -25,8 +26,6 @@ def export(
 
     Parameters
     ----------
-    run_folder
-        The run folder.
     format_name
         One of `schemas.export.EXPORT_FORMATS`.
     out

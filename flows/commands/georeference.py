@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from flows.options import OpenBrowser, Port, RunFolder
 from schemas.georeference import ControlPoint, ControlPointsRecord
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ Model = Literal["similarity", "affine"]
 
 
 def georeference(
-    run_folder: Path,
+    run_folder: RunFolder,
     /,
     *,
     points: Path | None = None,
@@ -25,8 +26,8 @@ def georeference(
     model: Model | None = None,
     map_: Annotated[str | None, Parameter(name="--map")] = None,
     check: Annotated[bool, Parameter(negative=())] = False,
-    port: int | None = None,
-    open_browser: Annotated[bool, Parameter(name="--open")] = True,
+    port: Port = None,
+    open_browser: OpenBrowser = True,
 ) -> int:
     """Georeference a finished run by three or more ground control points; no frame is registered again.
 
@@ -35,8 +36,6 @@ def georeference(
 
     Parameters
     ----------
-    run_folder
-        The run folder.
     points
         CSV `x_px,y_px,longitude,latitude`, or `x_px,y_px,x,y` with --epsg; a column `name` is optional.
         Pixels are those of the map, as the page shows them. Default: click the points in the browser.
@@ -50,10 +49,6 @@ def georeference(
         GeoTIFF, MBTiles of images, or a tile server, such as https://HOST/{z}/{x}/{y}.png.
     check
         Print the residuals of --points and change nothing.
-    port
-        Port of the page. Default: any free port.
-    open_browser
-        Open the browser, if there is a screen.
     """
     from velfield.errors import InputError
     from velfield.pipeline.georeference import fit_run_points

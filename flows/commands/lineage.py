@@ -1,15 +1,15 @@
 """``velfield lineage``: the lineage of a run, or of one pixel of its field."""
 
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
+from flows.options import RunFolder
 from velfield.errors import InputError
 
 
 def lineage(
-    run_folder: Path,
+    run_folder: RunFolder,
     x: str | None = None,
     y: int | None = None,
     /,
@@ -21,8 +21,6 @@ def lineage(
 
     Parameters
     ----------
-    run_folder
-        The run folder.
     x
         Column of the pixel, base pixels; or X,Y.
     y

@@ -5,20 +5,20 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from flows.options import DONE, INCOMPLETE, Quiet
+from flows.options import DONE, INCOMPLETE, Cluster, Quiet, RunFolder, Scheduler, Workers
 
 
 def reprocess(
-    run_folder: Path,
+    run_folder: RunFolder,
     /,
     *,
     base: Path,
     out: str | None = None,
     full: Annotated[bool, Parameter(negative=())] = False,
     max_error_px: float = 1.0,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    cluster: Path | None = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    cluster: Cluster = None,
     quiet: Quiet = False,
 ) -> int:
     """Put a new base image under a finished run, and recompute only what depends on it. The old result is kept.
@@ -28,8 +28,6 @@ def reprocess(
 
     Parameters
     ----------
-    run_folder
-        The run folder.
     base
         The new base image, as for `velfield run`.
     out
@@ -38,14 +36,6 @@ def reprocess(
         Always register the frames again.
     max_error_px
         Largest error of the registration to the old base image, in new base pixels, for mapping the results.
-    workers
-        Processes of a local cluster. Default: threads of this process.
-    scheduler
-        Address of a Dask scheduler.
-    cluster
-        File with the class of Dask clusters to use and its arguments; the documentation's page Examples has some.
-    quiet
-        Print warnings only.
     """
     from flows.launch import prepare_process
     from flows.stopping import stop_on_signals

@@ -8,7 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from flows.commands.start import own_command
-from flows.options import DONE, INCOMPLETE, Device, LogJson, Preset, Quiet, Settings, Verbose
+from flows.options import (
+    DONE,
+    INCOMPLETE,
+    Cluster,
+    ConfigFile,
+    Device,
+    LogJson,
+    Preset,
+    Quiet,
+    Scheduler,
+    Settings,
+    Verbose,
+    Workers,
+)
 from schemas.job import Inputs, Job, absolute
 from velfield.errors import InputError
 from velfield.pipeline.configuration import resolve_config
@@ -35,16 +48,16 @@ def run(
     timestamps: Path | None = None,
     telemetry: Path | None = None,
     fps: float | None = None,
-    config: Path | None = None,
-    preset: Preset | None = None,
+    config: ConfigFile = None,
+    preset: Preset = None,
     settings: Settings = (),
     every: str | None = None,
     start_s: float | None = None,
     stop_s: float | None = None,
     intervals: str | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    cluster: Path | None = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    cluster: Cluster = None,
     device: Device | None = None,
     plan: Annotated[bool, Parameter(negative=())] = False,
     quiet: Quiet = False,
@@ -86,12 +99,6 @@ def run(
         Drone metadata: subtitles (.SRT) or MISB KLV (.klv). Default: the file next to the video, or the metadata in it.
     fps
         Frame rate of a folder of images without timestamps, or of `--tracks` that have no times.
-    config
-        flight.yaml with the flight's configuration.
-    preset
-        Set of defaults to start from.
-    settings
-        One parameter, as `section.key=value`; can be repeated.
     every
         Take every n-th frame; `auto`: the frames nearest to 0.2 s apart.
     start_s
@@ -100,18 +107,10 @@ def run(
         Skip frames from this time on, seconds from the first frame.
     intervals
         Also compute a field for each time interval: `15min`, `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
-    workers
-        Processes of a local cluster. Default: threads of this process.
-    scheduler
-        Address of a Dask scheduler.
-    cluster
-        File with the class of Dask clusters to use and its arguments; the documentation's page Examples has some.
     device
         Device that runs the network: cpu, cuda, or auto (default), which uses a GPU if there is one.
     plan
         Print what would be computed, and stop.
-    quiet
-        Print warnings only.
     verbose
         Print more detail.
     log_json

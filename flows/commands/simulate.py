@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from flows.commands.start import own_command
-from flows.options import DONE, Quiet, parse_frame_size
+from flows.options import DONE, FrameSize, Quiet, Seed, parse_frame_size
 
 
 def simulate(
@@ -12,8 +12,8 @@ def simulate(
     /,
     *,
     frames: int = 300,
-    size: str = "1280x960",
-    seed: int = 0,
+    size: FrameSize = "1280x960",
+    seed: Seed = 0,
     clip: Literal["beside", "embedded"] | None = None,
     quiet: Quiet = False,
 ) -> int:
@@ -25,15 +25,9 @@ def simulate(
         Folder to write to.
     frames
         Number of frames.
-    size
-        Frame size, WxH in pixels.
-    seed
-        Seed of the city and the flight.
     clip
         Write a drone clip DJI_0001.MP4 (25 frames per second) instead of frames/.
         Its telemetry is `beside` it, in a file DJI_0001.SRT, or `embedded` in the clip.
-    quiet
-        Print warnings only.
     """
     write_simulation(out, frames=frames, size=size, seed=seed, quiet=quiet, clip=clip)
     if clip is not None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from flows.options import Preset, Settings
+from flows.options import ConfigFile, Preset, Settings
 from flows.stopping import stop_on_signals
 from velfield.errors import InputError
 
@@ -19,8 +19,8 @@ def train(
     gsd_m: float | None = None,
     continued: Annotated[str | None, Parameter(name="--continue")] = None,
     review: Path | None = None,
-    config: Path | None = None,
-    preset: Preset | None = None,
+    config: ConfigFile = None,
+    preset: Preset = None,
     settings: Settings = (),
 ) -> int:
     """Train a detector from labelled cars; `velfield run --detector` takes the file.
@@ -39,12 +39,6 @@ def train(
         Detector file to fine-tune. Default: `shipped`, the detector that comes with velfield.
     review
         PNG to write, with the detections on the labelled frames.
-    config
-        flight.yaml with the flight's configuration.
-    preset
-        Set of defaults to start from.
-    settings
-        One parameter, as `section.key=value`; can be repeated.
     """
     from velfield.pipeline.configuration import resolve_config
     from velfield.pipeline.train import train_from_labels, write_training

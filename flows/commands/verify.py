@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from flows.options import RunFolder
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,15 +16,13 @@ if TYPE_CHECKING:
 WHOLE, DAMAGED = 0, 3
 
 
-def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=())] = False) -> int:
+def verify(run_folder: RunFolder, /, *, repair: Annotated[bool, Parameter(negative=())] = False) -> int:
     """Compare every file and chunk of a run with its commit record; list what is damaged or missing.
 
     Exit status 0: intact; 3: damaged, or never finished.
 
     Parameters
     ----------
-    run_folder
-        The run folder.
     repair
         Recompute the damaged units from the same inputs.
     """

@@ -1,10 +1,9 @@
 """``velfield view``: a run's page in the browser."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
-
+from flows.options import OpenBrowser, Port, RunFolder
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
@@ -12,23 +11,13 @@ if TYPE_CHECKING:
 
 
 def view(
-    run_folder: Path,
+    run_folder: RunFolder,
     /,
     *,
-    port: int | None = None,
-    open_browser: Annotated[bool, Parameter(name="--open")] = True,
+    port: Port = None,
+    open_browser: OpenBrowser = True,
 ) -> int:
-    """Show a run's page in the browser until Ctrl-C, the answers first if it is analysed; for this machine alone.
-
-    Parameters
-    ----------
-    run_folder
-        The run folder.
-    port
-        Port to listen on. Default: any free port.
-    open_browser
-        Open the browser, if there is a screen.
-    """
+    """Show a run's page in the browser until Ctrl-C, the answers first if it is analysed; for this machine alone."""
     from velfield.run.layout import RunLayout
     from velfield.viewer.server import view_app
 

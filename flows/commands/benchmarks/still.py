@@ -2,16 +2,15 @@
 
 from pathlib import Path
 
+from flows.options import RunFolder
 from velfield.errors import InputError
 
 
-def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None) -> int:
+def still(run_folder: RunFolder, /, *, frames: int = 200, within: Path | None = None) -> int:
     """Track corners that registration does not use through the frames of a run, and print how they seem to move.
 
     Parameters
     ----------
-    run_folder
-        The run folder.
     frames
         At most so many frames, spread over the run.
     within
