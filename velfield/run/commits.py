@@ -45,20 +45,16 @@ def digest_bytes(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
-def digest_file(path: Path) -> str:
-    """Digest of a file's content."""
-    return _digest(path, whole_bytes=sys.maxsize)
-
-
 def digest_input(path: Path) -> str:
     """Digest of a file's content; of a file above 256 MiB, of its size and 64 blocks of 1 MiB spread over it.
 
     Hashing all of a flight of hours would take longer than decoding its first minutes.
     """
-    return _digest(path, whole_bytes=_WHOLE_FILE_BYTES)
+    return digest_file(path, whole_bytes=_WHOLE_FILE_BYTES)
 
 
-def _digest(path: Path, *, whole_bytes: int) -> str:
+def digest_file(path: Path, *, whole_bytes: int = sys.maxsize) -> str:
+    """Digest of a file's content; of a file above ``whole_bytes``, of blocks of it."""
     if is_remote(path):
         data = path.read_bytes()  # one request; its size and its blocks would be more
         return _digest_stream(io.BytesIO(data), len(data), whole_bytes)
