@@ -4,10 +4,8 @@ import http.client
 import json
 import re
 import signal
-import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import uvicorn
 
 from schemas.annotation import MarkedCar, Marks
 from schemas.flight import FramesConfig
@@ -28,7 +25,7 @@ from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.viewer.annotations import Frames, frames_to_annotate, read_marks, write_marks
 from velfield.viewer.annotator import annotate_app
-from velfield.viewer.server import page_policy, view_app
+from velfield.viewer.server import page_policy, serve_in_thread, view_app
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -56,15 +53,8 @@ class Client:
 
 @contextmanager
 def served(app: Any) -> Iterator[Client]:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = uvicorn.Server(uvicorn.Config(app, lifespan="off", ws="none", log_level="warning"))
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        try:
-            yield Client(listener.getsockname()[1])
-        finally:  # a failing test ends too
-            server.should_exit = True
-            thread.join(20)
+    with serve_in_thread(app, 0) as address:
+        yield Client(int(address.rpartition(":")[2]))
 
 
 @pytest.fixture
