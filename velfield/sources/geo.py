@@ -76,11 +76,9 @@ def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
     head = _read_magic(file)
     driver = next((name for magic, name in TIFF_DRIVERS if head.startswith(magic)), None)
     if driver is not None:
-        raster = _read_geotiff(file, config.max_pixels)
-    else:
-        grey = read_grey_image(file, config.max_pixels)  # refuses what it cannot read
-        raster = _read_beside(file, grey, head)
-    return _to_base_raster(file, raster, config.max_pixels)
+        return _read_geotiff(file, config.max_pixels)
+    grey = read_grey_image(file, config.max_pixels)  # refuses what it cannot read
+    return _read_beside(file, grey, head, config.max_pixels)
 
 
 def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *, name: str) -> float:
@@ -163,35 +161,11 @@ def reconcile_gsd(from_crs_m: float | None, given_m: float | None) -> float | No
     return from_crs_m
 
 
-@dataclass(frozen=True)
-class _Raster:
-    """Grey levels and georeference as read from the file; ``gsd_m`` of a local reference system."""
-
-    grey: GreyImage
-    valid: Mask | None
-    crs: CRS | None = None
-    affine: Affine | None = None
-    notes: tuple[str, ...] = ()
-    gsd_m: float | None = None
-
-
-def _to_base_raster(path: Path, raster: _Raster, max_pixels: int) -> BaseRaster:
-    if raster.crs is None or raster.affine is None:
-        return BaseRaster(raster.grey, gsd_m=raster.gsd_m, valid=raster.valid, notes=raster.notes)
-    if raster.crs.is_geographic:
-        raster = _to_utm(path, raster, max_pixels)
-    assert raster.crs is not None
-    assert raster.affine is not None
-    return BaseRaster(
-        grey=raster.grey,
-        crs_wkt=raster.crs.to_wkt(),
-        affine=tuple(raster.affine)[:6],
-        gsd_m=ground_sample_distance_m(
-            raster.crs, raster.affine, (raster.grey.shape[0], raster.grey.shape[1]), name=path.name
-        ),
-        valid=raster.valid,
-        notes=raster.notes,
-    )
+def _place(path: Path, raster: BaseRaster, crs: CRS, affine: Affine) -> BaseRaster:
+    """The image in a reference system with metres or feet."""
+    rows, columns = raster.grey.shape
+    gsd_m = ground_sample_distance_m(crs, affine, (rows, columns), name=path.name)
+    return replace(raster, crs_wkt=crs.to_wkt(), affine=tuple(affine)[:6], gsd_m=gsd_m)
 
 
 @contextmanager
@@ -216,7 +190,7 @@ def _read_magic(path: Path) -> bytes:
         ) from None
 
 
-def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
+def _read_geotiff(path: Path, max_pixels: int) -> BaseRaster:
     """Read with GDAL's GTiff driver alone: a VRT named .tif would read other files."""
     try:
         with ignore_missing_georeference():
@@ -229,10 +203,12 @@ def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
         raise InputError(
             f"{path.name}: the TIFF is truncated or damaged ({one_line(error)}), expected a whole one"
         ) from None
-    return _with_georeference(path, _Raster(grey, valid), crs, affine, points)
+    return _with_georeference(path, BaseRaster(grey, valid=valid), crs, affine, points, max_pixels)
 
 
-def _with_georeference(path: Path, raster: _Raster, crs: CRS | None, affine: Affine, points: int) -> _Raster:
+def _with_georeference(
+    path: Path, raster: BaseRaster, crs: CRS | None, affine: Affine, points: int, max_pixels: int
+) -> BaseRaster:
     """The image with the georeference that is there, or with a note why it is not used."""
     crs = crs if crs is not None else _prj(path)
     if affine.is_identity:
@@ -242,12 +218,14 @@ def _with_georeference(path: Path, raster: _Raster, crs: CRS | None, affine: Aff
     if crs is None:
         note = "a place without a .prj, .aux.xml or tag that names its reference system: it is not used"
         return replace(raster, notes=(note,))
-    if crs.is_geographic or crs.is_projected:
-        return replace(raster, crs=crs, affine=affine)
+    if crs.is_geographic:
+        return _to_utm(path, raster, crs, affine, max_pixels)
+    if crs.is_projected:
+        return _place(path, raster, crs, affine)
     return _with_local_scale(path, raster, crs, affine)
 
 
-def _with_local_scale(path: Path, raster: _Raster, crs: CRS, affine: Affine) -> _Raster:
+def _with_local_scale(path: Path, raster: BaseRaster, crs: CRS, affine: Affine) -> BaseRaster:
     """The image with the scale of a reference system that has no place on Earth, as surveys without GPS write it."""
     system = crs.to_dict(projjson=True)
     unit = system.get("coordinate_system", {}).get("axis", [{}])[0].get("unit")
@@ -297,9 +275,9 @@ def _first_band(path: Path, dataset: Any) -> Float32Array:
     return np.asarray(table[band], np.float32)
 
 
-def _read_beside(path: Path, grey: GreyImage, head: bytes) -> _Raster:
+def _read_beside(path: Path, grey: GreyImage, head: bytes, max_pixels: int) -> BaseRaster:
     """A plain image with the georeference of the world file and ``.prj`` or ``.aux.xml`` beside it."""
-    raster = _Raster(grey, None)
+    raster = BaseRaster(grey)
     driver = next((name for magic, name in _PICTURE_DRIVERS if head.startswith(magic)), None)
     if driver is None:
         return raster
@@ -308,7 +286,7 @@ def _read_beside(path: Path, grey: GreyImage, head: bytes) -> _Raster:
             crs, affine, points = dataset.crs, dataset.transform, len(dataset.gcps[0])
     except RasterioError as error:
         return replace(raster, notes=(f"its reference could not be read: {one_line(error)}",))
-    return _with_georeference(path, raster, crs, affine, points)
+    return _with_georeference(path, raster, crs, affine, points, max_pixels)
 
 
 def _prj(path: Path) -> CRS | None:
@@ -323,37 +301,35 @@ def _prj(path: Path) -> CRS | None:
         ) from None
 
 
-def _to_utm(path: Path, raster: _Raster, max_pixels: int) -> _Raster:
+def _to_utm(path: Path, raster: BaseRaster, crs: CRS, affine: Affine, max_pixels: int) -> BaseRaster:
     """Reproject from degrees, where a pixel has no length; bicubic, which keeps the image sharp for registration."""
-    assert raster.crs is not None
-    assert raster.affine is not None
     rows, columns = raster.grey.shape
-    centre_x, centre_y = _apply_affine(raster.affine, columns / 2, rows / 2)
-    (longitude,), (latitude,) = _to_degrees(raster.crs, [centre_x], [centre_y], path.name)
+    centre_x, centre_y = _apply_affine(affine, columns / 2, rows / 2)
+    (longitude,), (latitude,) = _to_degrees(crs, [centre_x], [centre_y], path.name)
     if not (-180 <= longitude <= 180 and -80 <= latitude <= 84):
         raise InputError(
             f"{path.name}: found its centre at {longitude:g}, {latitude:g} degrees, expected it between 80 south and "
             "84 north; fix its georeference"
         )
-    crs = utm_crs(longitude, latitude)
-    zone = crs.to_epsg() % 100
-    affine, width, height = _utm_grid(raster, crs)
+    utm = utm_crs(longitude, latitude)
+    zone = utm.to_epsg() % 100
+    grid, width, height = _utm_grid((rows, columns), crs, affine, utm)
     check_size(path, width, height, max_pixels)
     shape = (height, width)
     grey, valid = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     source = np.ones(raster.grey.shape, np.uint8) if raster.valid is None else raster.valid.astype(np.uint8)
-    transforms = {"src_crs": raster.crs, "src_transform": raster.affine, "dst_crs": crs, "dst_transform": affine}
+    transforms = {"src_crs": crs, "src_transform": affine, "dst_crs": utm, "dst_transform": grid}
     reproject(raster.grey, grey, resampling=Resampling.cubic, **transforms)
     reproject(source, valid, resampling=Resampling.nearest, **transforms)
     mask = valid > 0
     note = f"reprojected from degrees to UTM zone {zone}{'N' if latitude >= 0 else 'S'} ({width}x{height} px)"
-    return _Raster(grey, None if mask.all() else mask, crs, affine, (*raster.notes, note))
+    moved = BaseRaster(grey, valid=None if mask.all() else mask, notes=(*raster.notes, note))
+    return _place(path, moved, utm, grid)
 
 
-def _utm_grid(raster: _Raster, crs: CRS) -> tuple[Affine, int, int]:
+def _utm_grid(shape: tuple[int, int], crs: CRS, affine: Affine, utm: CRS) -> tuple[Affine, int, int]:
     """North-up grid of square pixels over the image, of the resolution along its diagonal (as GDAL's)."""
-    assert raster.affine is not None
-    rows, columns = raster.grey.shape
+    rows, columns = shape
     fraction = np.linspace(0, 1, 21)
     border = np.r_[
         np.c_[fraction * columns, np.zeros(21)],
@@ -361,8 +337,8 @@ def _utm_grid(raster: _Raster, crs: CRS) -> tuple[Affine, int, int]:
         np.c_[np.zeros(21), fraction * rows],
         np.c_[np.full(21, columns), fraction * rows],
     ]
-    xs, ys = zip(*(_apply_affine(raster.affine, column, row) for column, row in border), strict=True)
-    east, north = (np.asarray(values) for values in transform(raster.crs, crs, xs, ys))
+    xs, ys = zip(*(_apply_affine(affine, column, row) for column, row in border), strict=True)
+    east, north = (np.asarray(values) for values in transform(crs, utm, xs, ys))
     pixel = float(np.hypot(np.ptp(east), np.ptp(north)) / np.hypot(columns, rows))
     width, height = (max(int(np.ceil(np.ptp(values) / pixel - 1e-6)), 1) for values in (east, north))
     return Affine(pixel, 0, float(east.min()), 0, -pixel, float(north.max())), width, height
