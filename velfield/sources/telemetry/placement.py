@@ -164,16 +164,12 @@ class Place:
     ----------
     crs_wkt, affine
         The UTM zone, and (column, row) of pixel corners to its coordinates, as `velfield.sources.geo.BaseRaster`.
-    longitude_deg, latitude_deg
-        Position of the middle of the frames.
     sd_m
         Standard deviation of a position in either direction, m.
     """
 
     crs_wkt: str
     affine: tuple[float, float, float, float, float, float]
-    longitude_deg: float
-    latitude_deg: float
     sd_m: float
 
 
@@ -197,7 +193,6 @@ def estimate_place(poses: FramePoses, gsd_m: float, north: North) -> Place | Fai
     return Place(
         crs.to_wkt(),
         affine_of_pixels(linear, offset),
-        *middle,
         sd_m=float(np.linalg.norm([_SATELLITES_SD_M, spread_m, lean_m])),
     )
 
