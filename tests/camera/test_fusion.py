@@ -5,9 +5,10 @@ import pytest
 
 from schemas.camera import CameraRecord, ModelEvidence
 from velfield.camera import fusion
+from velfield.camera.frame_pairs import FramePairs, ScaledLens
 from velfield.camera.fusion import MAX_RESIDUAL, refine_lens
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
-from velfield.camera.multiview import FramePairs, MultiViewFit, ScaledLens
+from velfield.camera.multiview import MultiViewFit
 
 SHAPE = (480, 640)
 HALF = 400.0

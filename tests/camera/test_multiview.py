@@ -11,9 +11,10 @@ import pytest
 from schemas.camera import CameraRecord, ModelEvidence
 from schemas.job import Inputs, Job
 from tests.scenes import by_homography, city, photograph, rms_after_homography, similarity
+from velfield.camera.frame_pairs import FramePairs, ScaledLens
 from velfield.camera.fusion import CONFIRMED_SIGMAS, MIN_CV_GAIN, refine_lens
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
-from velfield.camera.multiview import FramePairs, MultiViewFit, ScaledLens, fit_multiview
+from velfield.camera.multiview import MultiViewFit, fit_multiview
 from velfield.camera.plumbline import SD_INFLATION
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages

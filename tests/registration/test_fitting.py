@@ -6,8 +6,9 @@ from scipy.optimize import minimize
 
 from velfield.camera.lens import HarrisLens
 from velfield.errors import Failure
+from velfield.registration.control_points import ControlPoints
 from velfield.registration.fitting import fit_polyprojective
-from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, robust_weights
+from velfield.registration.joint import JointFit, fit_jointly, robust_weights
 from velfield.registration.mesh import fit_mesh, fit_robust_mesh
 from velfield.registration.transforms import HomographyTransform, PolyprojectiveTransform, fit_normalisation
 

@@ -14,6 +14,7 @@ from velfield.camera.lens import HarrisLens, pinhole
 from velfield.errors import Failure
 from velfield.registration import frame_fit, intrasensor
 from velfield.registration.alignment import Templates, align_patches
+from velfield.registration.control_points import ControlPoints
 from velfield.registration.frame_fit import BaseReference, FrameFitter, FrameRegistration
 from velfield.registration.intrasensor import (
     ChainFrame,
@@ -24,7 +25,7 @@ from velfield.registration.intrasensor import (
     register_frame,
     shrink,
 )
-from velfield.registration.joint import ControlPoints, JointFit
+from velfield.registration.joint import JointFit
 from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.own_base import build_own_base
 from velfield.synthetic.cases import FLAT, PINHOLE, small_flight

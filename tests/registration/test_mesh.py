@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from velfield.registration import kernels, mesh
-from velfield.registration.joint import FOLDS, assign_folds
+from velfield.registration.control_points import FOLDS, assign_folds
 from velfield.registration.mesh import fit_mesh
 
 WIDTH, HEIGHT, CELL = 640, 480, 80

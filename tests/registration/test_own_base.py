@@ -6,7 +6,7 @@ import pytest
 from tests.scenes import city
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.registration import own_base
-from velfield.registration.joint import ControlPoints
+from velfield.registration.control_points import ControlPoints
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
 
 SHAPE = HEIGHT, WIDTH = 120, 160

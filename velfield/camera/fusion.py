@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.camera import CameraRecord, OverlapEvidence
+from velfield.camera.frame_pairs import FramePairs, ScaledLens, scale_distortion
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
-from velfield.camera.multiview import FramePairs, MultiViewFit, ScaledLens, fit_multiview, scale_distortion
+from velfield.camera.multiview import MultiViewFit, fit_multiview
 from velfield.camera.straighten import RadialLens
 
 MIN_FRAMES, MIN_PAIRS = 5, 6

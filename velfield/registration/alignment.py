@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.compiled import compiled
-from velfield.registration.joint import ControlPoints
+from velfield.registration.control_points import ControlPoints
 from velfield.registration.transforms import FrameTransform
 
 N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR = 3000, 6000

@@ -16,8 +16,9 @@ from velfield.registration.alignment import (
     smooth_coarse,
     smooth_fine,
 )
+from velfield.registration.control_points import ControlPoints, is_inlier, rms
 from velfield.registration.fitting import fit_by_case_deletion
-from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier, rms
+from velfield.registration.joint import JointFit, fit_jointly
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh, measure_support
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, count_row_knots

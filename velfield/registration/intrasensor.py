@@ -44,8 +44,8 @@ from velfield.registration.alignment import (
     Templates,
     make_template_sets,
 )
+from velfield.registration.control_points import ControlPoints
 from velfield.registration.frame_fit import BaseReference, FrameFitter, FrameRegistration, select_in_empty_cells
-from velfield.registration.joint import ControlPoints
 from velfield.registration.keypoints import (
     Keypoints,
     detect_keypoints,

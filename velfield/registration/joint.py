@@ -24,6 +24,16 @@ from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
 from velfield.registration import fit_kernels, kernels
+from velfield.registration.control_points import (
+    FOLDS,
+    MIN_SIGMA_PX,
+    ControlPoints,
+    assign_folds,
+    finite_median,
+    geman_mcclure,
+    is_inlier,
+    rms,
+)
 from velfield.registration.transforms import (
     FrameTransform,
     PolyprojectiveTransform,
@@ -32,9 +42,6 @@ from velfield.registration.transforms import (
     frame_corners,
 )
 
-FOLDS = 5
-FOLD_CELL_PX = 48
-"""Control points of one cell of this side share a fold: errors of neighbours are correlated."""
 _ANNEALING = (8.0, 6.0, 4.0, 3.0, 2.5, 2.5, 2.5)
 _WARM_ANNEALING = (5.0, 3.5, 2.5, 2.5)
 _ROUGH_ANNEALING = (5.0, 3.5, 2.5)
@@ -65,39 +72,6 @@ _RIDGE = 0.01
 _GAUGE = 1e5
 """Penalty on the spline's components that the polyprojective expresses too (shift, shear, bend along the rows): their
 sum alone is determined (gauge freedom)."""
-_INLIER_WEIGHT = 0.25
-"""Smallest weight of an inlier: a residual of about 1.6 times the robust scale."""
-_MIN_SIGMA_PX = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class ControlPoints:
-    """Correspondences between a raw frame and the base image.
-
-    Attributes
-    ----------
-    xy_raw, xy_base : (n, 2) px.
-    sigma_px : (n,) expected standard deviation of each; only the ratios matter.
-    """
-
-    xy_raw: FloatArray
-    xy_base: FloatArray
-    sigma_px: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.xy_raw)
-
-    def concatenate(self, other: "ControlPoints") -> "ControlPoints":
-        """These and the others, in this order."""
-        return ControlPoints(
-            np.concatenate([self.xy_raw, other.xy_raw]),
-            np.concatenate([self.xy_base, other.xy_base]),
-            np.concatenate([self.sigma_px, other.sigma_px]),
-        )
-
-    def select(self, mask: Mask) -> "ControlPoints":
-        """The control points of a mask (n,)."""
-        return ControlPoints(self.xy_raw[mask], self.xy_base[mask], self.sigma_px[mask])
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +109,6 @@ class JointFit:
     def cv_error_px(self) -> float:
         """RMS cross-validated residual of the inliers."""
         return rms(self.cv_residuals[self.inliers])
-
-
-def rms(vectors: FloatArray) -> float:
-    """Root mean square length of vectors (n, 2); NaN without any."""
-    return float(np.sqrt((vectors**2).sum(axis=1).mean())) if len(vectors) else float("nan")
 
 
 _Equations: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
@@ -332,12 +301,6 @@ def _gauge_directions(knots: int, *, homography: bool) -> FloatArray:
     return out.reshape(3 * knots, -1) if knots else np.zeros((0, 0))
 
 
-def assign_folds(xy_raw: FloatArray) -> IntArray:
-    """Fold (n,) of each raw point, by its cell alone: independent of the other points."""
-    cell = np.floor(np.asarray(xy_raw) / FOLD_CELL_PX).astype(np.int64)
-    return np.asarray((cell[:, 0] * 2 + cell[:, 1]) % FOLDS)
-
-
 def _initial_parameters(problem: _Problem, start: PolyprojectiveTransform, rows: FloatArray | None) -> FloatArray:
     """The parameter vector of the start, in the problem's normalisation."""
     theta = np.zeros(17 + 3 * problem.knots)
@@ -378,29 +341,8 @@ def _weights_and_scale(
 ) -> tuple[FloatArray, float]:
     """Geman-McClure weights (n,) and the robust scale (median) of the residuals over sigma."""
     size = np.hypot(*residuals.T) / sigma
-    scale = max(min(_median(size) / 1.1774, limit), _MIN_SIGMA_PX)
+    scale = max(min(finite_median(size) / 1.1774, limit), MIN_SIGMA_PX)
     return geman_mcclure(size / (width * scale)), scale
-
-
-def geman_mcclure(size: FloatArray) -> FloatArray:
-    """Weights (n,) of residuals of this size; 0 of those that are not finite."""
-    return np.asarray(np.where(np.isfinite(size), 1.0 / (1.0 + size * size) ** 2, 0.0))
-
-
-def _median(size: FloatArray) -> float:
-    """Of those that are finite; infinite without any."""
-    finite = size[np.isfinite(size)]
-    return float(np.median(finite)) if len(finite) else float("inf")
-
-
-def is_inlier(weights: FloatArray) -> Mask:
-    """Inliers (n,) by robust weights (n,)."""
-    return np.asarray(weights >= _INLIER_WEIGHT)
-
-
-def robust_scale(residuals: FloatArray, sigma: FloatArray) -> float:
-    """Robust standard deviation per coordinate of residuals (n, 2) over sigma (n,), by their median."""
-    return max(_median(np.hypot(*residuals.T) / sigma) / 1.1774, _MIN_SIGMA_PX)
 
 
 def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> FloatArray:

@@ -29,8 +29,9 @@ from scipy.spatial import cKDTree
 from schemas.arrays import Float32Array, FloatArray, IntArray
 from velfield.compiled import kernel
 from velfield.registration import fit_kernels
+from velfield.registration.control_points import FOLDS, ControlPoints, assign_folds
 from velfield.registration.fit_kernels import LANES
-from velfield.registration.joint import FOLDS, ControlPoints, JointFit, assign_folds, robust_weights
+from velfield.registration.joint import JointFit, robust_weights
 from velfield.registration.transforms import as_points, mesh_shape
 
 _STIFFNESSES = tuple(10.0**k for k in (-1, 0, 1, 2, 3))

@@ -26,9 +26,9 @@ from velfield.errors import Failure
 from velfield.parallel import parallel_map, usable_processors
 from velfield.registration import kernels
 from velfield.registration.background import NOT_COVERED, median_of_stack
+from velfield.registration.control_points import ControlPoints
 from velfield.registration.frame_fit import BaseReference, FrameRegistration
 from velfield.registration.intrasensor import ChainFrame, prepare_base, register_chain
-from velfield.registration.joint import ControlPoints
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, fit_normalisation
 from velfield.registration.warp import RawToBase, Rectification, Window, footprint, warp_to_base

@@ -13,8 +13,8 @@ import numpy as np
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.flight import RegistrationConfig
+from velfield.camera.frame_pairs import FramePairs
 from velfield.camera.lens import HarrisLens, Lens, pinhole
-from velfield.camera.multiview import FramePairs
 from velfield.parallel import parallel_map
 from velfield.registration.keypoints import Keypoints, Pairs, detect_keypoints, match_descriptors
 

@@ -13,9 +13,10 @@ from scipy.spatial import KDTree
 
 from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import BaseConfig
+from velfield.registration.control_points import FOLDS, ControlPoints, robust_scale
 from velfield.registration.intersensor.correlation import match_grid
 from velfield.registration.intersensor.modality import MODALITIES, Modality
-from velfield.registration.joint import FOLDS, ControlPoints, robust_scale, robust_weights
+from velfield.registration.joint import robust_weights
 from velfield.registration.mesh import NEIGHBOURS, Support, fit_mesh, measure_support, no_support
 from velfield.registration.transforms import MeshedTransform, PolyprojectiveTransform
 from velfield.registration.warp import warp_to_base
