@@ -21,7 +21,8 @@ def linear_bin_weights(values: FloatArray, width: float) -> tuple[IntArray, Floa
     return lower.astype(np.int64), position - lower
 
 
-def _entropy_nats(weights: NDArray[np.floating | np.integer]) -> float:
+def entropy_nats(weights: NDArray[np.floating | np.integer]) -> float:
+    """Entropy of a distribution of these weights, nats."""
     probability = weights[weights > 0] / weights.sum()
     return float(-np.sum(probability * np.log(probability)))
 
@@ -67,7 +68,7 @@ def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: f
             keys.append((frame * angle_bins + angle_key) * 65536 + distance_key + 32768)
             weights.append(angle_weight * distance_weight)
     _, inverse = np.unique(np.concatenate(keys), return_inverse=True)
-    entropy = _entropy_nats(np.bincount(inverse, weights=np.concatenate(weights)))
+    entropy = entropy_nats(np.bincount(inverse, weights=np.concatenate(weights)))
     return entropy - _mean_log_stretch(arcs, xy)
 
 

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 
 from schemas.arrays import FloatArray, GreyImage, IntArray
 from velfield.camera.edges import Arcs, detect_arcs_of_frames, pool_arcs
+from velfield.camera.entropy import entropy_nats, linear_bin_weights
 from velfield.camera.lens import Lens
 
 MIN_GAIN_NATS = 0.1
@@ -132,10 +133,8 @@ def _stretch(direction: FloatArray, convergence: FloatArray) -> FloatArray:
 
 def _entropy(position: FloatArray) -> float:
     """Entropy, nats, of positions in the bins of a circle, linearly binned and smoothed."""
-    low = np.floor(position).astype(np.int64)
-    upper = position - low
+    low, upper = linear_bin_weights(position, 1.0)
     counts = np.bincount(np.mod(low, _ANGLE_BINS), 1.0 - upper, _ANGLE_BINS)
     counts = counts + np.bincount(np.mod(low + 1, _ANGLE_BINS), upper, _ANGLE_BINS)
     smooth = 0.5 * counts + 0.25 * (np.roll(counts, 1) + np.roll(counts, -1))
-    share = smooth[smooth > 0] / smooth.sum()
-    return float(-np.sum(share * np.log(share)))
+    return entropy_nats(smooth)

@@ -355,32 +355,16 @@ def _count_below(values: Float32Array, limit: np.float32) -> np.int32:
 
 
 @kernel
-def _count_near(values: Float32Array, middle: np.float32, limit: np.float32) -> np.int32:
-    """Number of the values that lie closer than ``limit`` to ``middle``."""
-    count = np.int32(0)
-    for k in range(np.uint64(values.size)):
-        count += np.int32(abs(values[k] - middle) < limit)
-    return count
-
-
-@kernel
-def _median(values: Float32Array, middle: np.float32, count: int) -> np.float32:
-    """Median of ``count`` grey levels, to a sixteenth of one, or where ``middle`` is given that of the distances from
-    it; by halving the range, as counting takes vector instructions. Values above 256 do not count: so many of them
-    follow that ``values`` are whole vectors."""
-    low, high, steps = np.float32(-256.0), np.float32(256.0), _MEDIAN_STEPS
-    half = (count + 1) // 2
-    distances = not np.isnan(middle)
-    if distances:
-        low = np.float32(0.0)
-        if _count_near(values, middle, _NEAR_MEDIAN) >= half:
-            high, steps = _NEAR_MEDIAN, _NEAR_STEPS
-    elif _count_below(values, -_NEAR_MEDIAN) < half <= _count_below(values, _NEAR_MEDIAN):
-        low, high, steps = -_NEAR_MEDIAN, _NEAR_MEDIAN, _NEAR_STEPS
+def _median(values: Float32Array, low: np.float32, count: int) -> np.float32:
+    """Median of ``count`` grey levels from ``low`` on, to a sixteenth of one; by halving the range, as counting takes
+    vector instructions. Values above 256 do not count: so many of them follow that ``values`` are whole vectors."""
+    high, steps, half = np.float32(256.0), _MEDIAN_STEPS, (count + 1) // 2
+    near = max(low, -_NEAR_MEDIAN)
+    if _count_below(values, near) < half <= _count_below(values, _NEAR_MEDIAN):
+        low, high, steps = near, _NEAR_MEDIAN, _NEAR_STEPS
     for _ in range(steps):
         limit = np.float32(0.5) * (low + high)
-        below = _count_near(values, middle, limit) if distances else _count_below(values, limit)
-        if below < half:
+        if _count_below(values, limit) < half:
             low = limit
         else:
             high = limit
@@ -426,8 +410,9 @@ def _step(difference, weight, slope_x, slope_y, count, sums) -> tuple[float, flo
     ``difference`` is flat, as `_median` takes it, ``weight`` and the slopes are (rows, columns); ``sums`` (10, columns)
     is scratch.
     """
-    middle = _median(difference, np.float32(np.nan), count)
-    spread = np.float32(1.4826) * _median(difference, middle, count) + np.float32(1.0)
+    middle = _median(difference, np.float32(-256.0), count)
+    distances = np.abs(difference - middle)
+    spread = np.float32(1.4826) * _median(distances, np.float32(0.0), count) + np.float32(1.0)
     scale = np.float32(1.0) / (np.float32(TUKEY_C) * spread)
     _sum_columns(difference, weight, slope_x, slope_y, middle, scale, sums)
     s = sx = sy = sd = dd = xx = xy = yy = xd = yd = 0.0
