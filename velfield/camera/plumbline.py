@@ -65,62 +65,6 @@ _MAX_CENTRE_OFFSET = 0.1  # half-diagonals from the middle: beyond it the descen
 
 
 @dataclass(frozen=True)
-class CalibrationResult:
-    """A lens and the evidence for it; ``lens`` is the pinhole model if not ``accepted``.
-
-    Attributes
-    ----------
-    lens
-        Harris, division or polynomial model, or the pinhole model.
-    accepted, reason
-        Whether the distortion is significant, and why, in one line.
-    residual_px, residual_without_px
-        RMS distance of edge points from their lines with and without the lens, raw px.
-    a_sd, centre_sd_px
-        Standard deviations of Harris' distortion, inflated by `SD_INFLATION`, and of the centre, clustered by line.
-    entropy_a, entropy_nats
-        The grid of distortions and the entropy there.
-    candidates
-        Each model, with its cross-validated RMS.
-    """
-
-    lens: RadialLens
-    accepted: bool
-    reason: str
-    frame_shape: tuple[int, int]
-    frames: int = 0
-    lines: int = 0
-    edge_points: int = 0
-    residual_px: float | None = None
-    residual_without_px: float | None = None
-    a_sd: float | None = None
-    centre_sd_px: tuple[float, float] | None = None
-    entropy_a: tuple[float, ...] = ()
-    entropy_nats: tuple[float, ...] = ()
-    candidates: tuple[ModelEvidence, ...] = ()
-
-    def to_record(self) -> CameraRecord:
-        """The record that ``camera.json`` holds."""
-        return CameraRecord(
-            lens=self.lens.to_record(),
-            frame_width_px=self.frame_shape[1],
-            frame_height_px=self.frame_shape[0],
-            accepted=self.accepted,
-            reason=self.reason,
-            residual_px=self.residual_px,
-            residual_without_px=self.residual_without_px,
-            a_sd=self.a_sd,
-            centre_sd_px=self.centre_sd_px,
-            frames=self.frames,
-            lines=self.lines,
-            edge_points=self.edge_points,
-            entropy_a=self.entropy_a,
-            entropy_nats=self.entropy_nats,
-            candidates=self.candidates,
-        )
-
-
-@dataclass(frozen=True)
 class _EdgeData:
     """The arcs of all frames, with what each step derives from them."""
 
@@ -146,7 +90,7 @@ class _EdgeData:
         )
 
 
-def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) -> CalibrationResult:
+def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) -> CameraRecord:
     """Estimate the lens from frames of one camera.
 
     Parameters
@@ -160,7 +104,7 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
 
     Returns
     -------
-    CalibrationResult
+    CameraRecord
         With the pinhole model, and the reason, if no distortion is significant.
 
     Raises
@@ -169,18 +113,16 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
         No frames, or frames of different sizes.
     """
     shape = _common_shape(frames)
-    if config.calibrate == "never":
-        return CalibrationResult(pinhole(shape), False, "calibration is switched off", shape)
     data = _EdgeData(shape, _detect_and_pool(frames, shape, config), config.angle_bins)
     count = data.arcs.length_px.size
     if count < MIN_LINES:
         reason = f"{count} straight edges in {len(frames)} frames, {MIN_LINES} needed"
-        return CalibrationResult(pinhole(shape), False, reason, shape, frames=len(frames))
+        return pinhole_record(shape, reason, len(frames))
     grid_a, grid_entropy, start = _search_distortion(data, config.max_distortion)
     harris = _fit_harris(data, start)
     if harris is None:
         reason = f"fewer than {MIN_LINES} lines of sufficient length in {len(frames)} frames"
-        return CalibrationResult(pinhole(shape), False, reason, shape, frames=len(frames))
+        return pinhole_record(shape, reason, len(frames))
     fits, selected, lines, cv_px = _select_model(data, harris, seed)
     bounded = 0 < int(np.argmin(grid_entropy)) < len(grid_a) - 1
     accepted, reason = _decide(data, harris, fits[selected], lines, bounded=bounded)
@@ -193,21 +135,34 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
     centre_sd = spread[-2:] * data.pinhole.half_diagonal_px
     if accepted:
         reason += f"; refined by vanishing points {fits[0].parameters[0]:.3f} +- {a_sd:.3f}"
-    return CalibrationResult(
-        lens=fits[selected].lens if accepted else data.pinhole,
+    return CameraRecord(
+        lens=(fits[selected].lens if accepted else data.pinhole).to_record(),
+        frame_width_px=shape[1],
+        frame_height_px=shape[0],
         accepted=accepted,
         reason=reason,
-        frame_shape=shape,
-        frames=len(frames),
-        lines=lines.count,
-        edge_points=int(lines.line.size),
         residual_px=fits[selected].residual_px,
         residual_without_px=candidates[0].residual_px,
         a_sd=a_sd,
         centre_sd_px=(float(centre_sd[0]), float(centre_sd[1])),
+        frames=len(frames),
+        lines=lines.count,
+        edge_points=int(lines.line.size),
         entropy_a=tuple(float(a) for a in grid_a),
         entropy_nats=tuple(float(value) for value in grid_entropy),
         candidates=candidates,
+    )
+
+
+def pinhole_record(shape: tuple[int, int], reason: str, frames: int = 0) -> CameraRecord:
+    """The record of the pinhole model for frames of (height, width)."""
+    return CameraRecord(
+        lens=pinhole(shape).to_record(),
+        frame_width_px=shape[1],
+        frame_height_px=shape[0],
+        accepted=False,
+        reason=reason,
+        frames=frames,
     )
 
 

@@ -5,8 +5,8 @@ import numpy as np
 from schemas.arrays import GreyImage, IntArray
 from schemas.camera import CameraRecord, TiltEvidence
 from velfield.camera.fusion import refine_lens
-from velfield.camera.lens import lens_from_record, pinhole
-from velfield.camera.plumbline import calibrate
+from velfield.camera.lens import lens_from_record
+from velfield.camera.plumbline import calibrate, pinhole_record
 from velfield.camera.tilt import tilt_of_frames
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
@@ -33,17 +33,11 @@ def calibrate_flight(plan: Plan) -> StageResult:
     height, width = store.shape
     config = plan.config.lens
     if config.calibrate == "never":
-        record = CameraRecord(
-            lens=pinhole((height, width)).to_record(),
-            frame_width_px=width,
-            frame_height_px=height,
-            accepted=False,
-            reason="lens.calibrate is never: pinhole model used",
-        )
+        record = pinhole_record((height, width), "lens.calibrate is never: pinhole model used")
     else:
         frames = select_usable_frames(plan, config.frames)
         images = [store.read(frame) for frame in frames]
-        record = calibrate(images, config).to_record()
+        record = calibrate(images, config)
         if config.refine == "auto":
             record = refine_lens(record, match_frame_pairs(images, lens_from_record(record.lens)))
         record = record.model_copy(update={"tilt": _tilt(images[:_TILT_FRAMES], record)})
