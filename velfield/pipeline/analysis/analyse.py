@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord, QuestionRecord
+from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, QuestionRecord
 from schemas.arrays import GreyImage
-from schemas.export import PER_M_PER_S, SpeedUnit
+from schemas.export import SpeedUnit
 from schemas.flight import PAPER_GSD_M, FlightConfig, FramesConfig
 from velfield.analysis.answers import explain_none, find_answers
 from velfield.analysis.movements.gates import ArmNames
@@ -195,7 +195,7 @@ def write_analysis(
     analysis.answer_all()
     _check_names(analysis)
     gsd_m = analysis.trajectories.gsd_m
-    lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis, speed_unit)
+    lanes = lanes_record(analysis, speed_unit)
     write_atomically(out / "lanes.json", lanes.model_dump_json().encode())
     write_atomically(out / "lanes.geojson", lanes_geojson(lanes, georeference).encode())
     clips = dict(unusual_clips(analysis, frames)) if frames else {}
@@ -263,25 +263,3 @@ def _with_clips(table: AnalysisTable, clips: Mapping[int, bytes]) -> AnalysisTab
     )
     column = AnalysisColumn(name="clip", title="Pictures")
     return table.model_copy(update={"rows": rows, "columns": (*table.columns, column)})
-
-
-def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis, unit: SpeedUnit) -> LanesRecord:
-    """With the limits of lanes, and whether junctions have a signal and are on one level."""
-    known = [(road, sign) for road in analysis.free_flow if (sign := road.limit(unit))]
-    limits = {lane: sign / PER_M_PER_S[unit] for road, sign in known for lane in road.lanes}
-    return lanes.model_copy(
-        update={
-            "lanes": tuple(lane.model_copy(update={"limit_m_per_s": limits.get(lane.lane)}) for lane in lanes.lanes),
-            "junctions": tuple(
-                junction.model_copy(
-                    update={
-                        "signalised": analysis.signals[junction.junction].signalised,
-                        "kind": analysis.junction_kind(junction.junction),
-                    }
-                )
-                if junction.junction in analysis.signals
-                else junction
-                for junction in lanes.junctions
-            ),
-        }
-    )

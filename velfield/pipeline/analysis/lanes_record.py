@@ -8,12 +8,16 @@ import numpy as np
 
 from schemas.analysis import ConnectionRecord, JunctionRecord, LaneRecord, LanesRecord, Point
 from schemas.arrays import FloatArray
-from velfield.analysis.lanes.model import LaneGraph
+from schemas.export import PER_M_PER_S, SpeedUnit
+from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.exports.georeference import Georeference
 
 
-def lanes_record(graph: LaneGraph, gsd_m: float) -> LanesRecord:
-    """``lanes.json`` of a lane graph."""
+def lanes_record(analysis: TrafficAnalysis, unit: SpeedUnit) -> LanesRecord:
+    """``lanes.json``: the lane graph, with the limits of lanes by signs in a unit, and the junctions' signals."""
+    graph, gsd_m = analysis.lanes, analysis.trajectories.gsd_m
+    known = [(road, sign) for road in analysis.free_flow if (sign := road.limit(unit))]
+    limits = {lane: sign / PER_M_PER_S[unit] for road, sign in known for lane in road.lanes}
     return LanesRecord(
         gsd_m=gsd_m,
         lanes=tuple(
@@ -28,6 +32,7 @@ def lanes_record(graph: LaneGraph, gsd_m: float) -> LanesRecord:
                 right=lane.right,
                 predecessors=tuple(graph.predecessors[lane.number]),
                 successors=tuple(graph.successors[lane.number]),
+                limit_m_per_s=limits.get(lane.number),
             )
             for lane in graph
         ),
@@ -38,13 +43,14 @@ def lanes_record(graph: LaneGraph, gsd_m: float) -> LanesRecord:
         junctions=tuple(
             JunctionRecord(
                 junction=junction.number,
-                kind=junction.kind,
+                kind=analysis.junction_kind(junction.number),
                 x_px=round(float(junction.centre_m[0] / gsd_m), 2),
                 y_px=round(float(junction.centre_m[1] / gsd_m), 2),
                 hull_px=points_px(junction.hull_m, gsd_m),
                 lanes_in=junction.lanes_in,
                 lanes_out=junction.lanes_out,
                 lanes_inside=junction.lanes_inside,
+                signalised=signal.signalised if (signal := analysis.signals.get(junction.number)) else None,
             )
             for junction in graph.junctions
         ),
