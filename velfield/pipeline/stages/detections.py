@@ -114,7 +114,7 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     for frame in frames:
         found = search(frame) if usable[frame] else None
         if found is not None:
-            parts.append(_FrameCars(frame, float(times_s[frame]), found.keep(_supported(working, found, frame))))
+            parts.append((frame, float(times_s[frame]), found.keep(_supported(working, found, frame))))
         advance("detections")
     return _tabulate(parts)
 
@@ -185,13 +185,8 @@ class _Found:
         return replace(self, detections=detections, cars=cars, xy_base=self.xy_base[rows])
 
 
-@dataclass(frozen=True)
-class _FrameCars:
-    """Cars and candidates of a frame, with its number and time."""
-
-    frame: int
-    time_s: float
-    found: _Found
+_FrameCars = tuple[int, float, _Found]
+"""A frame's number, its time, s, and its cars and candidates."""
 
 
 class _Search:
@@ -269,14 +264,14 @@ _WEAK_CROPS = ("chips", "strips", "xy_work")
 
 def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:
     """Frames as two tables, of the cars and of the weak candidates."""
-    cars = _select_rows(parts, [slice(0, part.found.cars) for part in parts], _NO_CROPS)
-    weak = _select_rows(parts, [slice(part.found.cars, None) for part in parts], _WEAK_CROPS)
-    return BlockDetections(cars, weak, np.array([part.found.searched for part in parts]))
+    cars = _select_rows(parts, [slice(0, found.cars) for *_, found in parts], _NO_CROPS)
+    weak = _select_rows(parts, [slice(found.cars, None) for *_, found in parts], _WEAK_CROPS)
+    return BlockDetections(cars, weak, np.array([found.searched for *_, found in parts]))
 
 
 def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice], names: Iterable[str]) -> Cars:
     """Some rows of each frame, as one table, and their crops of these names: a table a frame cost 4 ms a frame."""
-    all_found = [part.found for part in parts]
+    all_found = [found for *_, found in parts]
     detections = [one.detections for one in all_found]
     number = [np.arange(len(one))[some] for one, some in zip(detections, rows, strict=True)]
     counts = [len(one) for one in number]
@@ -287,11 +282,11 @@ def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice], names: Iter
     def join(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
         return np.concatenate([np.empty(0), *(array[some] for array, some in zip(arrays, rows, strict=True))])
 
-    frame = repeat([part.frame for part in parts], "int64")
+    frame = repeat([frame for frame, *_ in parts], "int64")
     column = {
         "detection_id": frame * ID_STEP + np.concatenate([np.empty(0, np.int64), *number]),
         "frame": frame,
-        "time_s": repeat([part.time_s for part in parts], "float64"),
+        "time_s": repeat([time_s for _, time_s, _ in parts], "float64"),
         "x_px": join([one.xy_base[:, 0] for one in all_found]),
         "y_px": join([one.xy_base[:, 1] for one in all_found]),
         "orientation_rad": join([one.orientation_rad for one in detections]),
