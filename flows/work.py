@@ -53,8 +53,6 @@ class UnderWay:
     ended: set[int] = field(default_factory=set)
     lost: dict[str, str] = field(default_factory=dict)
     """Why units failed, by their names."""
-    before: list[CommitRecord] = field(default_factory=list)
-    """Records of the units that an earlier run finished."""
 
 
 class Aside(Protocol):
@@ -200,10 +198,7 @@ class Work:
 
     def _submit(self, under_way: UnderWay, k: int, graph: GraphOf) -> None:
         plan, stage, unit = under_way.plan, under_way.stage, under_way.units[k]
-        record = under_way.records[k]
-        under_way.before += [] if record is None else [record]
-
-        failed = ""
+        record, failed = under_way.records[k], ""
 
         def do() -> CommitRecord:
             nonlocal failed
@@ -268,7 +263,7 @@ class Work:
             under_way.stage.name,
             records,
             units=len(under_way.units),
-            before=under_way.before,
+            before=[record for k in under_way.futures if (record := under_way.records[k]) is not None],
             lost=lost,
             seconds=time.monotonic() - under_way.started_s,
         )
