@@ -5,7 +5,7 @@ to the flight's own base image, a median mosaic free of traffic: the same camera
 pixel. A given image is then first checked against one frame, and the own base image is registered to it once.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
 
@@ -82,8 +82,7 @@ def build_base(plan: Plan) -> StageResult:
                 *_written_lens(layout),
                 write_reference(plan, direct.reference),
             ]
-            finished = _finish(plan, grid, outputs, given=given, fit=direct.fit)
-            return replace(finished, notes=[*finished.notes, *direct.notes])
+            return _finish(plan, grid, outputs, given=given, fit=direct.fit, notes=direct.notes)
         lens, lens_notes = _check_area(plan, store.read(reference), given, direct.lens)
         lens_notes = lens_notes or direct.notes
     own, reference = _build_own_base(plan, detect, lens, spread, _reference_frames(spread, sharpness))
@@ -110,8 +109,7 @@ def build_base(plan: Plan) -> StageResult:
         fit, written = _register_to_given(plan, own, given)
         grid = _given_grid(plan, given, reference, fit)
         outputs += written
-    finished = _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
-    return replace(finished, notes=[*finished.notes, *lens_notes])
+    return _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit, notes=lens_notes)
 
 
 def _reference_frames(spread: list[int], sharpness: FloatArray) -> list[int]:
@@ -160,6 +158,7 @@ def _finish(
     frames: int | None = None,
     given: BaseRaster | None = None,
     fit: BaseFit | None = None,
+    notes: Sequence[str],
 ) -> StageResult:
     """Write the grid; ``frames``: number of frames in the own base image, None if there is none."""
     layout = plan.layout
@@ -173,9 +172,9 @@ def _finish(
     if frames is not None:
         counts["frames"] = float(frames)
     if given is None or fit is None:
-        return StageResult(outputs, counts)
+        return StageResult(outputs, counts, list(notes))
     counts |= {"intersensor_error_px": fit.error_px, "scale": fit.scale, "covered": fit.covered}
-    return StageResult(outputs, counts, [*given.notes, fit.note()], fit.warnings())
+    return StageResult(outputs, counts, [*given.notes, fit.note(), *notes], fit.warnings())
 
 
 def _check_area(plan: Plan, grey: GreyImage, given: BaseRaster, lens: Lens) -> tuple[Lens, list[str]]:
