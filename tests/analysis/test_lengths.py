@@ -20,7 +20,7 @@ def with_lengths(analysis: TrafficAnalysis, length_m: float) -> TrafficAnalysis:
 
 
 def test_the_gap_is_from_bumper_to_bumper() -> None:
-    cars = TrafficAnalysis(gather([drive(EAST, 2.0 * k) for k in range(12)]))
+    cars = TrafficAnalysis(gather([drive(EAST, 2.0 * k) for k in range(30)]))
     lorries = with_lengths(cars, LORRY_M)
     (car,), (lorry,) = cars.flows, lorries.flows
     assert car.gap_s is not None

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from hashlib import sha256
 from os import environ
 from pathlib import Path
+from sys import platform
 from typing import TYPE_CHECKING, Any
 
 from velfield.errors import InputError
@@ -169,4 +170,4 @@ def _listen(port: int | None) -> socket.socket:
 
 
 def _has_screen() -> bool:
-    return "DISPLAY" in environ or "WAYLAND_DISPLAY" in environ
+    return platform == "darwin" or "DISPLAY" in environ or "WAYLAND_DISPLAY" in environ
