@@ -191,13 +191,13 @@ def gate_links(before: DetectionStates, after: DetectionStates, limits: Limits) 
     high = np.searchsorted(rows, before.y_px + 2 * reach, side="right")
     first, position = _expand(low, high)
     second = order[position]
-    length = np.hypot(after.x_px[second] - before.x_px[first], after.y_px[second] - before.y_px[first])
+    dx, dy = after.x_px[second] - before.x_px[first], after.y_px[second] - before.y_px[first]
+    length = np.hypot(dx, dy)
     tried, near = int(np.sum(length <= 2 * reach)), length <= reach
-    first, second = first[near], second[near]
+    first, second, dx, dy = first[near], second[near], dx[near], dy[near]
     slow = limits.stationary_speed_px_per_s * interval + widening
-    moved = after.x_px[second] - before.x_px[first], after.y_px[second] - before.y_px[first]
-    fits_before, cost_before = _axis_test(*moved, before, first, slow, noise, limits)
-    fits_after, cost_after = _axis_test(*moved, after, second, slow, noise, limits)
+    fits_before, cost_before = _axis_test(dx, dy, before, first, slow, noise, limits)
+    fits_after, cost_after = _axis_test(dx, dy, after, second, slow, noise, limits)
     fits = np.flatnonzero(fits_before & fits_after)
     ranked = fits[np.lexsort((second[fits], first[fits]))]
     counts = (tried, tried - len(first), len(first) - len(fits))
