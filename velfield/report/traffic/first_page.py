@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from schemas.export import SpeedUnit
 from velfield.analysis.answers import count_text, duration_text, find_answers, longest_queues, queue_text
 from velfield.analysis.movements.movements import JunctionMovements
+from velfield.analysis.signals.cycles import Queue
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, compare_delays
 
@@ -52,9 +53,12 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             if answer.topic == "signal" and answer.estimate and fairness.get(answer.subject):
                 found["signal"].append(place + fairness[answer.subject])
 
+    waits: list[str] = []
     for found_at in _met(analysis):
-        for arm in set(longest_queues(analysis, found_at)) - {d.arm for d in delays[found_at.junction.number]}:
-            withheld.append(f"delay: junction {found_at.junction.number} from {arm}: {_WHY_NO_DELAY}")
+        number, longest = found_at.junction.number, longest_queues(analysis, found_at)
+        waits += _approaches(found_at, delays[number], longest)
+        for arm in set(longest) - {d.arm for d in delays[number]}:
+            withheld.append(f"delay: junction {number} from {arm}: {_WHY_NO_DELAY}")
 
     def why(topic: str, otherwise: str) -> str:
         return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
@@ -69,7 +73,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
         ),
         (
             "Which approach waits longest, and how long are the queues?",
-            _waits(analysis, delays),
+            waits,
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
         ("Is there a signal, and is it fair?", found.get("signal", []), why("signal", no_junction)),
@@ -96,20 +100,13 @@ def _more(lines: list[str]) -> tuple[str, ...]:
     return (f"and {len(lines) - _PER_QUESTION} more, in the tables",) if len(lines) > _PER_QUESTION else ()
 
 
-def _waits(analysis: TrafficAnalysis, delays: Mapping[int, list[ApproachDelay]]) -> list[str]:
-    """A line on each approach with a known delay or queue: of the junctions with most vehicles first, and of these the
-    approach that waits longest."""
-    return [line for found in _met(analysis) for line in _approaches(analysis, found, delays[found.junction.number])]
-
-
 def _met(analysis: TrafficAnalysis) -> list[JunctionMovements]:
     """Junctions where ways meet, that with most vehicles first."""
     return sorted((m for m in analysis.movements if analysis.ways_meet(m.junction.number)), key=lambda m: -m.volume)
 
 
-def _approaches(analysis: TrafficAnalysis, found: JunctionMovements, known: list[ApproachDelay]) -> list[str]:
-    """A line on each approach of a junction with a known delay or queue."""
-    longest = longest_queues(analysis, found)
+def _approaches(found: JunctionMovements, known: list[ApproachDelay], longest: Mapping[str, Queue]) -> list[str]:
+    """A line on each approach of a junction with a known delay or queue: that which waits longest first."""
     delays = {delay.arm: delay for delay in known}
     out = []
     for name in (*delays, *(name for name in longest if name not in delays)):
