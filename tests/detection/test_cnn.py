@@ -49,7 +49,7 @@ def test_fine_tuning_is_deterministic_and_keeps_the_attribution() -> None:
     one, again = (fine_tune([few], shipped(), record, config) for _ in range(2))
     assert one == again
     assert one.attribution == record.attribution
-    assert one.threshold == record.threshold  # too few cars for folds
+    assert one.threshold == record.threshold  # too few cars to hold some out
     assert one.onnx != record.onnx
 
 

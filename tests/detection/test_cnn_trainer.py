@@ -152,18 +152,6 @@ def test_fine_tuning_does_not_depend_on_how_a_batch_is_halved() -> None:
         np.testing.assert_allclose(other[name], gradient, rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
 
 
-def test_the_halves_at_once_or_one_after_the_other_give_the_same_bits() -> None:
-    network = trained().network()
-    results = []
-    for at_once in (True, False):
-        trainer = Trainer.from_network(network, halves_at_once=at_once)
-        for _ in range(3):
-            trainer.train_step(random_batch(n=4), 1e-2)
-        results.append(trainer.parameters)
-    for name, values in results[0].items():
-        np.testing.assert_array_equal(results[1][name], values)
-
-
 def test_fine_tuning_starts_from_copies_of_the_weights() -> None:
     network = trained().network()
     before = {name: weights.copy() for name, weights in network.weights.items()}

@@ -1,4 +1,4 @@
-"""Evaluation on labelled cars held out of training, in spatial folds: precision, recall, and the score threshold."""
+"""Evaluation on labelled cars held out of training: precision, recall, and the score threshold."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,13 +9,15 @@ from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.detector import PrecisionRecallCurve
 from velfield.detection.samples import LabelledImage
 
-MIN_CARS_FOR_FOLDS = 16
+MIN_CARS_TO_HOLD_OUT = 16
 """With fewer labelled cars none are held out to choose the score threshold."""
 MATCH_PX = 8.0
 """A detection this near to a car's centre is that car, working px: half its length."""
 MIN_CURVE_SCORE = -0.25
 """Detections with a lower score are false at any precision that is of use."""
-FOLDS_DESCRIPTION = "cars in held-out stripes of the images, detected by detectors trained on the other stripes"
+HELD_OUT_DESCRIPTION = (
+    "cars in held-out stripes of the images, detected after half of the training, on the other stripes"
+)
 _CURVE_POINTS = 400
 _RECALL_FRACTION = 0.95
 """Fraction of the recall at the lowest score: the operating point if labels are incomplete (precision unknown)."""
@@ -43,13 +45,12 @@ class HeldOutScores:
     complete: bool
 
 
-def spatial_fold(sample: LabelledImage, fold: int, folds: int) -> Mask:
-    """Region (h, w) that a fold holds out: two stripes across the longer side, each with as many cars as the others."""
+def held_out_half(sample: LabelledImage) -> Mask:
+    """Region (h, w) to hold out: every other of four stripes across the longer side with as many cars each."""
     height, width = sample.image.shape
-    axis, count = 0 if width >= height else 1, 2 * folds
-    borders = np.quantile(sample.cars[:, axis], np.arange(1, count) / count) if len(sample.cars) else np.empty(0)
-    stripe = np.searchsorted(borders, np.arange(max(width, height)))
-    inside = stripe % folds == fold
+    axis = 0 if width >= height else 1
+    borders = np.quantile(sample.cars[:, axis], (0.25, 0.5, 0.75)) if len(sample.cars) else np.empty(0)
+    inside = np.searchsorted(borders, np.arange(max(width, height))) % 2 == 0
     return np.broadcast_to(inside if axis == 0 else inside[:, None], (height, width))
 
 
@@ -76,7 +77,7 @@ def match_labels(detections: FloatArray, cars: FloatArray, ignore: FloatArray) -
 
 
 def merge_scores(parts: Sequence[HeldOutScores]) -> HeldOutScores:
-    """The detections of several images or folds together."""
+    """The detections of several images together."""
     return HeldOutScores(
         score=np.concatenate([part.score for part in parts]),
         correct=np.concatenate([part.correct for part in parts]),

@@ -1,7 +1,7 @@
 """Fine-tuning the pre-trained network on labelled images; choosing its score threshold.
 
-The threshold comes from held-out spatial folds: the network is fine-tuned once for each fold without that part of the
-images and evaluated there. With few labels it is shrunk towards the pre-trained detector's threshold.
+The threshold comes from held-out stripes: half of the steps are made without them, the network is evaluated there, and
+the other half is made on everything. With few labels it is shrunk towards the pre-trained detector's threshold.
 """
 
 from collections.abc import Sequence
@@ -19,22 +19,20 @@ from velfield.detection.cnn.model import detect_cars
 from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.evaluation import (
-    FOLDS_DESCRIPTION,
-    MIN_CARS_FOR_FOLDS,
+    HELD_OUT_DESCRIPTION,
+    MIN_CARS_TO_HOLD_OUT,
     MIN_CURVE_SCORE,
     HeldOutScores,
+    held_out_half,
     match_labels,
     merge_scores,
     precision_recall_curve,
-    spatial_fold,
 )
 from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage, in_region, restrict_to_region
-from velfield.parallel import parallel_map, usable_processors
+from velfield.parallel import parallel_map
 
-_FOLDS = 2
-"""Each trained for its share of the steps, so that all of them cost as much as the network itself."""
 _FINE_TUNING_RATE = 1e-3
 _UNLABELLED_MIN_PROBABILITY, _LABELLED_RADIUS_PX, _UNLABELLED_MARGIN_PX = 0.12, 18, 3
 """In an incompletely labelled image a pixel of at least this probability may be an unlabelled car, except within a
@@ -58,14 +56,12 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
     """
     masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained), samples)
     count = sum(len(sample.cars) for sample in samples)
-    folds = _FOLDS if count >= MIN_CARS_FOR_FOLDS else 0
-    tasks: list[int | None] = [None, *range(folds)]
-    spare = usable_processors() > len(tasks) - 1  # the folds together take as long as the network itself
-    (network, _), *held_out = parallel_map(
-        lambda fold: _fine_tune_fold(masked, pretrained, config, fold, halves_at_once=spare),
-        tasks,
-    )
-    evidence = merge_scores([part for _, parts in held_out for part in parts]) if held_out else None
+    trainer, steps, evidence = Trainer.from_network(pretrained), config.fine_tune_steps, None
+    if count >= MIN_CARS_TO_HOLD_OUT:
+        evidence = _train_on_half(trainer, masked, steps // 2, config.seed + 1)
+        steps -= steps // 2
+    dataset = PatchDataset([masked], [1.0], config.seed)
+    network = train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
     threshold, curve = select_threshold(evidence, record.threshold)
     if curve is not None:
         weight = count / (count + _PRIOR_CARS)
@@ -78,7 +74,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
 
 def select_threshold(evidence: HeldOutScores | None, default: float) -> tuple[float, PrecisionRecallCurve | None]:
     """Score threshold and precision-recall curve on held-out cars; the default where too few were held out."""
-    curve = None if evidence is None else precision_recall_curve(evidence, FOLDS_DESCRIPTION)
+    curve = None if evidence is None else precision_recall_curve(evidence, HELD_OUT_DESCRIPTION)
     if curve is None or curve.operating_point is None:
         return default, None
     return curve.threshold[curve.operating_point], curve
@@ -97,28 +93,15 @@ def make_record(
     )
 
 
-def _fine_tune_fold(
-    samples: Sequence[LabelledImage],
-    pretrained: Network,
-    config: CnnConfig,
-    fold: int | None,
-    *,
-    halves_at_once: bool,
-) -> tuple[Network, list[HeldOutScores]]:
-    """Fine-tune without a fold's stripes and evaluate on them; without a fold, fine-tune on everything."""
-    steps, seed = config.fine_tune_steps, config.seed
-    trainer = Trainer.from_network(pretrained, halves_at_once=halves_at_once)
-    if fold is None:
-        dataset = PatchDataset([samples], [1.0], seed)
-        return train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE), []
-    held_out = [spatial_fold(sample, fold, _FOLDS) for sample in samples]
+def _train_on_half(trainer: Trainer, samples: Sequence[LabelledImage], steps: int, seed: int) -> HeldOutScores:
+    """Train without half of the images, in stripes, and evaluate there."""
+    held_out = [held_out_half(sample) for sample in samples]
     training = [restrict_to_region(sample, ~region) for sample, region in zip(samples, held_out, strict=True)]
-    dataset = PatchDataset([training], [1.0], seed + 1 + fold)
-    steps = -(-steps // _FOLDS)
+    dataset = PatchDataset([training], [1.0], seed)
     network = train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
-    return network, [
-        evaluate_network(network, sample, region) for sample, region in zip(samples, held_out, strict=True)
-    ]
+    return merge_scores(
+        parallel_map(lambda part: evaluate_network(network, *part), zip(samples, held_out, strict=True))
+    )
 
 
 def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> LabelledImage:

@@ -86,20 +86,18 @@ class Trainer:
     Attributes
     ----------
     parameters : by name: ``LAYER.w`` and ``LAYER.b``.
-    halves_at_once : whether the two halves of a batch are computed on two processors; the result is the same.
     """
 
     parameters: dict[str, Float32Array]
-    halves_at_once: bool = True
     _moments: dict[str, tuple[Float32Array, Float32Array]] = field(default_factory=dict)
     _steps: int = 0
 
     @classmethod
-    def from_network(cls, network: Network, *, halves_at_once: bool = True) -> "Trainer":
+    def from_network(cls, network: Network) -> "Trainer":
         """A trained network, for fine-tuning."""
         parameters = {f"{name}.w": weights.copy() for name, weights in network.weights.items()}
         parameters |= {f"{name}.b": biases.copy() for name, biases in network.biases.items()}
-        return cls(parameters, halves_at_once=halves_at_once)
+        return cls(parameters)
 
     def network(self) -> Network:
         """The trained network."""
@@ -142,8 +140,7 @@ class Trainer:
         normaliser = LossNormaliser.of(batch)
         if len(batch.images) < 2:
             return self._loss_and_gradients(batch, normaliser)
-        apply = parallel_map if self.halves_at_once else map
-        (first, of_first), (second, of_second) = apply(
+        (first, of_first), (second, of_second) = parallel_map(
             lambda half: self._loss_and_gradients(half, normaliser), batch.halves()
         )
         return first + second, {name: gradient + of_second[name] for name, gradient in of_first.items()}
