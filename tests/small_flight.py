@@ -12,7 +12,7 @@ from velfield.run.commits import digest_bytes
 from velfield.run.layout import RunLayout
 
 SMALL = (
-    "detection.fine_tune_steps=2",
+    "detection.fine_tune_steps=6",
     "lens.refine=never",
     "registration.max_keypoints=1200",
     "work.unit_frames=8",

@@ -169,7 +169,8 @@ class GroupWriter:
     def _write(self, row: int, column: int, tile: FieldTile, name: str) -> NDArray[np.int32]:
         """Write a histogram, then fill it with zeros."""
         passed = tile.count > 0
-        if tile.histogram[passed].any():  # weights of milliseconds may all be zero
+        y, x = np.argwhere(passed)[0]
+        if tile.histogram[y, x].any() or tile.histogram[passed].any():  # weights of milliseconds may all be zero
             self.store.write_tile(row, column, tile.histogram, tile.count, name)
             tile.histogram[passed] = 0
         return tile.histogram

@@ -39,7 +39,10 @@ def encode_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], tile: in
     side = block_side(tile)
     index = np.full((tile // side, tile // side, 2), _NOT_STORED, "<u8")
     parts, end = [], 0
-    for row, column in np.unique(np.argwhere(count) // side, axis=0):
+    y, x = np.nonzero(count)
+    passed = np.zeros((tile // side, tile // side), np.bool_)
+    passed[y // side, x // side] = True
+    for row, column in np.argwhere(passed):
         window = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
         block = np.ascontiguousarray(histogram[window], "<i4")
         if block.shape[:2] != (side, side):  # at the map's edge
@@ -64,8 +67,16 @@ def encode_chunk(values: NDArray[Any], shape: tuple[int, ...], fill: Any) -> byt
     return bytes(_CODEC.encode(whole))
 
 
-def decode_tile(shard: bytes, shape: tuple[int, ...], tile: int) -> NDArray[np.int32]:
+def decode_tile(
+    shard: bytes, shape: tuple[int, ...], tile: int, *, into: NDArray[np.int32] | None = None
+) -> NDArray[np.int32]:
     """The histogram of a shard, of shape (ty, tx, nvy, nvx).
+
+    Parameters
+    ----------
+    into
+        Of that shape: the blocks that are stored are written into it, and what it holds elsewhere stays. None: a new
+        array, zero elsewhere.
 
     Raises
     ------
@@ -78,7 +89,7 @@ def decode_tile(shard: bytes, shape: tuple[int, ...], tile: int) -> NDArray[np.i
     if _checksum(index_bytes) != shard[-_CHECKSUM_BYTES:]:
         raise ValueError("the checksum of its index is wrong")
     index = np.frombuffer(index_bytes, "<u8").reshape(blocks)
-    histogram = np.zeros(shape, np.int32)
+    histogram = np.zeros(shape, np.int32) if into is None else into
     for row, column in np.argwhere(index[..., 0] != _NOT_STORED):
         start, size = map(int, index[row, column])
         block = np.frombuffer(_CODEC.decode(shard[start : start + size]), "<i4").reshape(side, side, *shape[2:])

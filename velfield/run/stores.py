@@ -484,8 +484,13 @@ class FieldStore:
         """Whether the tile's file exists."""
         return self._tile_path(row, column, name).exists()
 
-    def read_tile(self, row: int, column: int, name: str = HISTOGRAM) -> NDArray[np.int32]:
+    def read_tile(
+        self, row: int, column: int, name: str = HISTOGRAM, *, into: NDArray[np.int32] | None = None
+    ) -> NDArray[np.int32]:
         """One tile of a histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
+
+        ``into``: an earlier tile that nobody needs any more. Where it has the shape of this one it is returned, right
+        where vehicles passed and with any values elsewhere: to clear 22 MB takes longer than to read the rest.
 
         Raises
         ------
@@ -496,7 +501,8 @@ class FieldStore:
         side = self.tile
         shape = (min(side, height - row * side), min(side, width - column * side), *bins)
         try:
-            return decode_tile(self._tile_path(row, column, name).read_bytes(), shape, side)
+            into = None if into is None or into.shape != shape else into
+            return decode_tile(self._tile_path(row, column, name).read_bytes(), shape, side, into=into)
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
 

@@ -44,12 +44,13 @@ def flow_bytes(store: FieldStore, *, gsd_m: float | None, stationary_speed_px_pe
     side = cell_side(store.shape, gsd_m)
     count = np.where(_flowing(store, stationary_speed_px_per_s), store.layer("count"), 0)
     columns, across = -(-store.shape[1] // side), store.tile // side
-    found = []
+    found, histogram = [], None
     for row, column in store.stored_chunks(HISTOGRAM):
         window = np.s_[row * store.tile : (row + 1) * store.tile, column * store.tile : (column + 1) * store.tile]
         if not count[window].any():
             continue
-        cells, vehicles, bins = _draw_tile(store.read_tile(row, column), count[window], side, across)
+        histogram = store.read_tile(row, column, into=histogram)
+        cells, vehicles, bins = _draw_tile(histogram, count[window], side, across)
         down, right = np.divmod(cells, across)
         found.append(((row * across + down) * columns + column * across + right, vehicles, bins))
     if not found:
