@@ -101,7 +101,8 @@ class RegistrationConfig(Model):
     max_keypoints: PositiveInt = 4000
     """Keypoints kept a frame, spread by cells."""
     keypoint_scale: PositiveFloat = Field(0.5, le=1)
-    """Image scale of keypoint detection; matches are refined below the pixel at full size."""
+    """Image scale of keypoint detection (an image beyond 5 megapixels is reduced to these first); matches are refined
+    below the pixel at full size."""
     match_search_px: PositiveInt = 50
     """Side of the square around the predicted position in which a match is searched. Paper: 50 x 50."""
     drop_fraction: PositiveFloat = Field(0.05, lt=1)

@@ -188,7 +188,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=19,
+        version=20,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),
