@@ -87,7 +87,7 @@ class StageBars:
             if first[2] != total or (done > 0 and not first[1]):  # the first waits for what is read and compiled once
                 first = now_s, done, total
             begin_s, begun, _ = first
-            if self.log is not None and done < total and now_s - self.logged_s >= _LINE_EVERY_S:
+            if self.log is not None and 0 < done < total and now_s - self.logged_s >= _LINE_EVERY_S:
                 self.logged_s = now_s
                 left_s = (now_s - begin_s) * (total - done) / (done - begun) if done > begun else None
                 left = "" if left_s is None else f", about {left_s:.0f} s left"

@@ -1,27 +1,28 @@
 """Flows as a server runs them: parameters are JSON, each wraps the flow of a command."""
 
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from prefect import flow, get_run_logger
 
 from flows.artifacts import page_address
 from flows.console import Console, print_with_time
 from flows.launch import prepare_process
+from flows.prefect_flows import end_state
 from flows.process_flight import run_flight
 from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig, read_runner
+from schemas.summary import RunSummary
 from velfield.errors import InputError, one_line
 from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.plan import OtherFlightError
 from velfield.pipeline.watch import find_image, inputs_of, newest_image, run_folders, run_name
 from velfield.run.layout import RunLayout, to_path
 
-if TYPE_CHECKING:
-    from schemas.job import Job
-
 
 @flow(name="process-dropped-flight", flow_run_name="{source}", persist_result=False)
-def process_dropped(source: str, runs: str, cluster: str = "") -> str:
+def process_dropped(source: str, runs: str, cluster: str = "") -> object:
     """Process a flight that was dropped into the watched folder.
 
     Parameters
@@ -36,17 +37,17 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
     """
     prepare_process(verbose=False)
     try:
-        job = _dropped_job(Path(source), Path(runs))
-        summary = run_flight(job, _runner(cluster), Console("quiet"))
+        summary = _run_dropped(Path(source), Path(runs), _runner(cluster))
     except Exception as error:  # in the terminal too: else nothing there follows "has arrived"
-        print_with_time(f"{Path(source).name} failed: {one_line(error)}")
+        why = str(error) if isinstance(error, InputError) else one_line(error)
+        print_with_time(f"{Path(source).name} failed: {why}")
         raise
     for line in summary.frames_lost:
         get_run_logger().warning(line)
-    lost = f", {len(summary.frames_lost)} frames lost" if summary.frames_lost else ""
+    lost = "" if summary.complete else f", but {summary.loss}"
     report = RunLayout(Path(summary.root)).report
     print_with_time(f"{Path(source).name} is done{lost}: {page_address(report) or report.as_uri()}")
-    return summary.root
+    return summary.root if summary.complete else end_state(summary)
 
 
 @flow(name="reprocess-runs", flow_run_name="{base}", persist_result=False)
@@ -91,9 +92,15 @@ def _runner(cluster: str) -> RunnerConfig:
     return read_runner(Path(cluster)) if cluster else RunnerConfig()
 
 
-def _dropped_job(drop: Path, runs: Path) -> "Job":
+def _run_dropped(drop: Path, runs: Path, runner: RunnerConfig) -> RunSummary:
+    """Process a flight in the folder of its name; with a number behind it where another flight of that name was there,
+    as drones name the first clip of every card alike."""
     from schemas.job import Job
 
     inputs, config = inputs_of(drop)
-    root = RunLayout(runs / run_name(drop)).root
-    return Job(root=str(root), inputs=inputs, config=resolve_config(file=config))
+    for number in count(1):
+        name = run_name(drop) if number == 1 else f"{run_name(drop)}-{number}"
+        job = Job(root=str(RunLayout(runs / name).root), inputs=inputs, config=resolve_config(file=config))
+        with suppress(OtherFlightError):
+            return run_flight(job, runner, Console("quiet"))
+    raise AssertionError("the numbers do not end")

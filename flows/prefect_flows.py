@@ -10,6 +10,7 @@ from prefect import get_run_logger, task
 from prefect.cache_policies import NO_CACHE
 from prefect.exceptions import MissingContextError
 from prefect.futures import PrefectFuture
+from prefect.states import Completed
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from flows.artifacts import LongStage, publish_summary
@@ -28,8 +29,11 @@ class PrefectFlows(Orchestration):
         self._shown: dict[Future[Any], PrefectFuture[Any]] = {}
 
     def run(self, flow: Callable[[], T], *, name: str, run_name: str, threads: int, parameters: Any) -> T:
-        def shown(parameters: Any) -> T:
-            return flow()
+        found: list[T] = []
+
+        def shown(parameters: Any) -> object:
+            found.append(flow())
+            return end_state(found[0])
 
         runner: Any = ThreadPoolTaskRunner(max_workers=threads)
         as_flow = prefect_flow(
@@ -39,7 +43,8 @@ class PrefectFlows(Orchestration):
             persist_result=False,
             validate_parameters=False,
         )
-        return as_flow(shown)(parameters)
+        as_flow(shown)(parameters)
+        return found[0]
 
     def submit(
         self, do: Callable[[], T], *, name: str, run_name: str, retries: int = 0, after: Sequence[Future[Any]] = ()
@@ -67,6 +72,13 @@ class PrefectFlows(Orchestration):
 
     def publish(self, plan: Plan, summary: RunSummary) -> None:
         publish_summary(plan, summary)
+
+
+def end_state(outcome: object) -> object:
+    """What a flow returns: its outcome, or where a run lost something the state ``Incomplete``, which says how much."""
+    if not isinstance(outcome, RunSummary) or outcome.complete:
+        return outcome
+    return Completed(name="Incomplete", message=f"{outcome.loss}; its summary says why")
 
 
 def _worth_retrying(_task: Any, run: Any, state: Any) -> bool:

@@ -170,7 +170,9 @@ class Work:
         for k, unit in enumerate(units):
             if gone := [name for name in self._alike(stage) if unit.name in self._stages[name].lost]:
                 under_way.ended.add(k)
-                under_way.lost[unit.name] = f"{self._describe(under_way, unit)} not done: its {gone[0]} are lost"
+                under_way.lost[unit.name] = (
+                    f"{self._describe(under_way, unit)} not done, as its part of {gone[0]} is lost"
+                )
                 discard_unit(self.plan, stage, unit.name)
         return under_way
 

@@ -43,3 +43,10 @@ class RunSummary(Model):
     def complete(self) -> bool:
         """Whether nothing was lost."""
         return not self.frames_lost and not self.footage_lost and not any(stage.lost for stage in self.stages)
+
+    @property
+    def loss(self) -> str:
+        """What was lost, in one line."""
+        units = sum(len(stage.lost) for stage in self.stages)
+        absent = ", part of the recording is missing" if self.footage_lost else ""
+        return f"incomplete: {len(self.frames_lost)} frames and {units} units lost{absent}"

@@ -215,6 +215,10 @@ def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity") ->
     return conclude(summary, console)
 
 
+_LISTED = 10
+"""Lost frames that the terminal names; the report has all."""
+
+
 def conclude(summary: "RunSummary", console: "Console") -> int:
     """Say where the results are and what was lost; the exit status."""
     from velfield.run.layout import is_remote, to_path
@@ -227,14 +231,11 @@ def conclude(summary: "RunSummary", console: "Console") -> int:
         console.result(f"page    {own_command()} view {shlex.quote(str(root))}")
     if summary.complete:
         return DONE
-    for line in (*summary.footage_lost, *summary.frames_lost[:10]):
+    for line in (*summary.footage_lost, *summary.frames_lost[:_LISTED]):
         console.warn(line)
-    lost_units = sum(len(stage.lost) for stage in summary.stages)
-    absent = ", part of the recording is missing" if summary.footage_lost else ""
-    console.warn(
-        f"{summary.root}: done, but incomplete: {len(summary.frames_lost)} frames and {lost_units} units lost"
-        f"{absent}; the report lists them"
-    )
+    if (more := len(summary.frames_lost) - _LISTED) > 0:
+        console.warn(f"and {more} more frames")
+    console.warn(f"{summary.root}: done, but {summary.loss}; the report lists them")
     return INCOMPLETE
 
 

@@ -16,6 +16,7 @@ from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.trainer import Trainer
 from velfield.detection.registry import shipped_detector
 from velfield.detection.samples import LabelledImage
+from velfield.errors import InputError
 
 
 @cache
@@ -51,6 +52,14 @@ def test_fine_tuning_is_deterministic_and_keeps_the_attribution() -> None:
     assert one.attribution == record.attribution
     assert one.threshold == record.threshold  # too few cars to hold some out
     assert one.onnx != record.onnx
+
+
+def test_labels_that_do_not_lie_on_cars_are_refused() -> None:
+    """Those of another picture would train a detector that finds nothing."""
+    labelled, other = city(9504), city(9505)
+    config, record = CnnConfig(fine_tune_steps=2), shipped_detector().record
+    with pytest.raises(InputError, match="labels do not lie on the cars of these pictures"):
+        fine_tune([replace(labelled, cars=other.cars)], shipped(), record, config)
 
 
 def test_the_threshold_of_few_cars_is_shrunk_towards_the_pretrained_one() -> None:

@@ -245,6 +245,16 @@ def test_refused_labels_leave_no_folder(flight: Path, server: None, tmp_path: Pa
     assert not (tmp_path / "run").exists()
 
 
+def test_a_scale_at_which_no_car_can_be_seen_is_refused(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    """A slip of the decimal point: the search for cars of 2 px takes hours."""
+    shutil.copytree(whole[0], tmp_path / "run")
+    work = job(flight, tmp_path / "run")
+    with pytest.raises(InputError, match=r"found a scale of 2\.3 m a pixel of the map, at which a car is 1\.7 px long"):
+        process(work.model_copy(update={"config": work.config.model_copy(update={"gsd_m": 2.3})}))
+
+
 def test_commit_records_hold_counts_and_digests(whole: tuple[Path, RunSummary]) -> None:
     root, _ = whole
     record = json.loads((root / "commits" / "detections" / "000008-000015.json").read_text())

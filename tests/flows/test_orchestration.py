@@ -10,6 +10,7 @@ from flows import orchestration, prefect_server
 from flows.orchestration import Orchestration, Threads
 from flows.prefect_server import choose_orchestration
 from flows.runners import WorkersKilledError
+from schemas.summary import RunSummary, StageSummary
 from velfield.errors import InputError
 
 
@@ -58,6 +59,23 @@ def test_tasks_read_those_before(by: Orchestration) -> None:
         return by.submit(lambda: 2, name="two", run_name="two", after=[first]).result(60)
 
     assert by.run(flow, name="flow", run_name="flow", threads=1, parameters=None) == 2
+
+
+def test_a_run_that_lost_frames_is_shown_as_incomplete(server: None) -> None:
+    from prefect.states import State
+
+    from flows.prefect_flows import end_state
+
+    stage = StageSummary(name="registration", units=2, done_before=0, lost=("1",), seconds=1.0, text="")
+    summary = RunSummary(root="RUN", stages=(stage,), frames_lost=("frame 1 (0.2 s): not processed",))
+    shown = end_state(summary)
+    assert isinstance(shown, State)
+    assert (shown.name, shown.is_completed()) == ("Incomplete", True)
+    assert str(shown.message).startswith("incomplete: 1 frames and 1 units lost")
+    by = choose_orchestration()
+    assert by.run(lambda: summary, name="flow", run_name="flow", threads=1, parameters=None) is summary
+    whole = RunSummary(root="RUN", stages=())
+    assert end_state(whole) is whole
 
 
 def test_an_error_of_the_flow_is_raised(by: Orchestration) -> None:

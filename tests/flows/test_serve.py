@@ -23,13 +23,18 @@ import psutil
 import pytest
 import yaml
 
+from flows import deployed
 from flows.artifacts import page_address
+from flows.console import Console
 from flows.deployed import process_dropped, reprocess_runs
 from flows.launch import PAGES, PAGES_OF
+from flows.runners import RunnerConfig
 from flows.serve import ServeConfig, check, deployments, settings, watching
+from schemas.job import Job
 from schemas.summary import RunSummary
 from tests.browser import browser
 from velfield.errors import InputError
+from velfield.pipeline.plan import OtherFlightError
 from velfield.pipeline.watch import FolderWatcher, find_image, inputs_of, newest_image, run_folders, run_name
 from velfield.run.layout import to_path
 
@@ -170,6 +175,33 @@ def test_an_arrival_is_reported_once_when_it_no_longer_grows(tmp_path: Path) -> 
     watch.poll(11.0)
     watch.poll(99.0)
     assert text == ["new.mp4"]
+    for k, name in enumerate(("new.mp4", "old.mp4")):  # replaced: a mended copy
+        (tmp_path / "part").write_bytes(b"123")
+        (tmp_path / "part").rename(tmp_path / name)
+        watch.poll(100.0 + 20 * k)
+        watch.poll(106.0 + 20 * k)
+        assert text[1 + k :] == [name]
+    watch.poll(199.0)
+    assert len(text) == 3
+
+
+def test_a_flight_of_the_name_of_another_gets_a_folder_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drones name the first clip of every card alike."""
+    roots: list[str] = []
+
+    def run(job: Job, _runner: RunnerConfig, _console: Console) -> RunSummary:
+        roots.append(Path(job.root).name)
+        if len(roots) < 3:
+            raise OtherFlightError("the run of another")
+        return RunSummary(root=job.root, stages=())
+
+    monkeypatch.setattr(deployed, "run_flight", run)
+    (tmp_path / "DJI_0001.MP4").write_bytes(b"")
+    found = deployed._run_dropped(tmp_path / "DJI_0001.MP4", tmp_path / "runs", RunnerConfig())
+    assert roots == ["DJI_0001", "DJI_0001-2", "DJI_0001-3"]
+    assert Path(found.root).name == "DJI_0001-3"
 
 
 def test_what_a_drone_writes_beside_a_video_is_no_flight(

@@ -70,7 +70,7 @@ def estimate_vehicle_scale(
         low_m=gsd_m * float(np.exp(-_Z * total)),
         high_m=gsd_m * float(np.exp(_Z * total)),
         source="vehicles",
-        note=f"{int(good.sum())} vehicles, of which the usual car is {CAR_LENGTH_M:g} m long",
+        note=f"{int(good.sum())} vehicles; the median car is taken to be {CAR_LENGTH_M:g} m long",
     )
 
 

@@ -278,8 +278,12 @@ def write_clips(root: Path, clips: Sequence[Path]) -> Path:
     return path
 
 
-def _other_flight(root: Path, before: str, now: str) -> InputError:
-    return InputError(
+class OtherFlightError(InputError):
+    """The folder holds the run of another flight."""
+
+
+def _other_flight(root: Path, before: str, now: str) -> OtherFlightError:
+    return OtherFlightError(
         f"{root} holds the run of {before}, which that of {now} would overwrite; give another --out, or remove the "
         "folder first"
     )

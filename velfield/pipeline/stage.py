@@ -230,7 +230,7 @@ STAGES: tuple[Stage, ...] = (
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
-            Line("trained already: ready to use", lambda counts: counts.get("labels") == 0),
+            Line("the shipped detector, as it is", lambda counts: counts.get("labels") == 0),
             Line("trained on {labels:.0f} labelled cars"),
         ),
         unit=f"{_STAGES}.detector:make_detector",
@@ -247,10 +247,10 @@ STAGES: tuple[Stage, ...] = (
         label="detections",
         lines=(
             Line(
-                "{cars:.0f} marks of cars in {frames:.0f} frames; {searched:.0%} of their area was searched",
+                "{cars:.0f} detections of vehicles in {frames:.0f} frames; {searched:.0%} of their area was searched",
                 lambda counts: "searched" in counts,
             ),
-            Line("{cars:.0f} marks of cars in {frames:.0f} frames"),
+            Line("{cars:.0f} detections of vehicles in {frames:.0f} frames"),
         ),
         block=f"{_STAGES}.detections:detect_block",
         unit=f"{_STAGES}.detections:write_detections",
@@ -281,11 +281,11 @@ STAGES: tuple[Stage, ...] = (
         label="tracks",
         lines=(
             Line(
-                "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets; {doubtful:.0f} doubtful ones and "
-                "{lone:.0f} detections in no track set aside",
+                "{tracks:.0f} vehicle tracks; {doubtful:.0f} doubtful ones and {lone:.0f} detections in no track set "
+                "aside",
                 lambda counts: "lone" in counts and bool(counts["doubtful"] + counts["lone"]),
             ),
-            Line("{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets"),
+            Line("{tracks:.0f} vehicle tracks"),
         ),
         unit=f"{_STAGES}.tracks:chain_tracks",
         after=("tracklets",),

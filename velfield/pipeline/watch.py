@@ -138,30 +138,37 @@ def _inside(folder: Path, name: str) -> Path:
 
 
 class FolderWatcher:
-    """Calls back once for each entry of a folder, when it has not changed for a while."""
+    """Calls back for each entry of a folder when it has not changed for a while, and again after it was replaced."""
 
     def __init__(
         self, folder: Path, settle_s: float, callback: Callable[[Path], None], *, include_existing: bool
     ) -> None:
         self._folder, self._settle_s, self._callback = folder, settle_s, callback
-        self._done = set() if include_existing else set(self._entries())
+        self._done = {} if include_existing else {path: _changed_at(path) for path in self._entries()}
         self._seen: dict[Path, tuple[tuple[int, int, int], float]] = {}
 
     def poll(self, now_s: float) -> None:
         """Check the folder once; ``now_s`` is any monotonic clock."""
         for path in self._entries():
-            if path in self._done:
+            changed_at = _changed_at(path)
+            if changed_at == self._done.get(path):
                 continue
             state = _state(path)
             before, since_s = self._seen.get(path, (None, now_s))
             if state != before:
                 self._seen[path] = (state, now_s)
             elif now_s - since_s >= self._settle_s:
-                self._done.add(path)
+                self._done[path] = changed_at
                 self._callback(path)
 
     def _entries(self) -> list[Path]:
         return sorted(path for path in self._folder.iterdir() if not path.name.startswith("."))
+
+
+def _changed_at(path: Path) -> tuple[int, int]:
+    """Which file or folder this is, and its last change, of a folder by what is directly in it."""
+    found = path.stat()
+    return found.st_ino, found.st_mtime_ns
 
 
 def _state(path: Path) -> tuple[int, int, int]:

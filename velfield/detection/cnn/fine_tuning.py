@@ -31,9 +31,12 @@ from velfield.detection.evaluation import (
 from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage, in_region, restrict_to_region
+from velfield.errors import InputError
 from velfield.parallel import parallel_map
 
 _FINE_TUNING_RATE = 1e-3
+_MIN_FOUND = 0.2
+"""Fraction of the held-out cars: of labels that belong to other pictures a few are found by chance."""
 _UNLABELLED_MIN_PROBABILITY, _LABELLED_RADIUS_PX, _UNLABELLED_MARGIN_PX = 0.12, 18, 3
 """In an incompletely labelled image a pixel of at least this probability may be an unlabelled car, except within a
 radius of a labelled one, its shadow included."""
@@ -53,12 +56,18 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
         background.
     record
         Record of the pre-trained detector: its threshold, and who made it.
+
+    Raises
+    ------
+    InputError
+        The labels do not lie on cars: hardly one that was held out is found.
     """
     masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained), samples)
     count = sum(len(sample.cars) for sample in samples)
     trainer, steps, evidence = Trainer.from_network(pretrained), config.fine_tune_steps, None
     if count >= MIN_CARS_TO_HOLD_OUT:
         evidence = _train_on_half(trainer, masked, steps // 2, config.seed + 1)
+        _check_found(evidence)
         steps -= steps // 2
     dataset = PatchDataset([masked], [1.0], config.seed)
     network = train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
@@ -70,6 +79,16 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
         curve = curve.model_copy(update={"operating_point": nearest})
     found = make_record(network, threshold if config.threshold is None else config.threshold, curve, count, config)
     return found.model_copy(update={"attribution": record.attribution})
+
+
+def _check_found(evidence: HeldOutScores) -> None:
+    found = int(evidence.correct.sum())
+    if found < _MIN_FOUND * evidence.car_count:
+        raise InputError(
+            f"the detector finds {found} of {evidence.car_count} labelled cars that it was not trained on, expected "
+            "most of them: the labels do not lie on the cars of these pictures; check that they are of this video, by "
+            "their frame numbers and by the size of the pictures that they were drawn in"
+        )
 
 
 def select_threshold(evidence: HeldOutScores | None, default: float) -> tuple[float, PrecisionRecallCurve | None]:

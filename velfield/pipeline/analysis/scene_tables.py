@@ -74,8 +74,8 @@ def relation_table(analysis: TrafficAnalysis) -> AnalysisTable:
     ]
     note = (
         f"Arms are named by where they lead to ({analysis.arm_names.legend}); “inside” is a yard or a garage. "
-        "A vehicle whose track is cut, and not found again, is taken to go where the others went that drove where it "
-        "was lost."
+        "The destination of a vehicle whose track ends within the picture is inferred from those that passed the place "
+        "where it ended."
     )
     relations = analysis.scene.relations if analysis.scene else ()
     return make_table(

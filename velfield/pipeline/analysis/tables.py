@@ -279,7 +279,7 @@ def unusual_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("time", "Time", "s", lambda u: u.time_s, 1),
         Column("detail", "What", "", lambda u: u.detail),
     ]
-    note, rows = "Look at them: an error of tracking is one too.", analysis.unusual
+    note, rows = "Look at the clips: an error of tracking looks unusual too.", analysis.unusual
     return make_table(analysis, "unusual", "Unusual", "Unusual tracks", note, columns, rows, lambda u: u.xy_m)
 
 

@@ -36,6 +36,8 @@ from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_first_grid
 from velfield.run.stores import open_frames
 
+_MIN_CAR_PX = 5.0
+"""The shipped network finds next to nothing of shorter cars, and searches images a hundred times as large for them."""
 _FRAMES_TO_MEASURE = 4
 _FRAMES_TO_CALIBRATE = 3
 _MIN_FRAMES_WITH_BOXES = 0.5
@@ -118,8 +120,23 @@ def _scale_of_length(plan: Plan, length_raw_px: float, base_per_raw: float) -> f
 
 
 def _scale_of_gsd(plan: Plan) -> float | None:
-    gsd_m = read_first_grid(plan.layout).gsd_m
-    return None if gsd_m is None else working_scale(plan.config.detection, gsd_m)
+    """Working px a base px where the scale of the map is known.
+
+    Raises
+    ------
+    InputError
+        At that scale a car would be too short to be seen.
+    """
+    gsd_m, car_m = read_first_grid(plan.layout).gsd_m, plan.config.detection.car_length_m
+    if gsd_m is None:
+        return None
+    length_px = car_m / (gsd_m * base_px_per_raw_px(plan))
+    if length_px < _MIN_CAR_PX:
+        raise InputError(
+            f"found a scale of {gsd_m:g} m a pixel of the map, at which a car is {length_px:.2g} px long in a frame; "
+            f"expected {_MIN_CAR_PX:g} px or more; give metres a pixel with --gsd-m, as 0.23"
+        )
+    return working_scale(plan.config.detection, gsd_m)
 
 
 def _known_scale(plan: Plan) -> float:
