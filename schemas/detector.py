@@ -238,14 +238,3 @@ class OnnxRecord(BaseRecord):
 
 
 DetectorRecord = Annotated[CnnRecord | PaperRecord | OnnxRecord, Field(discriminator="method")]
-
-
-class DimensionsRecord(Model):
-    """The network that measures vehicles: fully connected layers with ReLU between them."""
-
-    widths: list[PositiveInt]
-    """Numbers of values from layer to layer, input and output included."""
-    weights_f16: list[str]
-    """Weights of each layer (in, out), half precision, base64."""
-    biases_f16: list[str]
-    """Biases of each layer (out,), half precision, base64."""

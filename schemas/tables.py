@@ -53,7 +53,7 @@ DIMENSION_COLUMNS: dict[str, str] = {
     "length_sd_px": "float32",  # standard deviation
     "width_px": "float32",
     "width_sd_px": "float32",
-    "strips": "int32",  # number of images that they were measured on
+    "strips": "int32",  # number of detections that they were measured on
 }
 """Dimensions of vehicles, a row a track."""
 

@@ -2,7 +2,8 @@
 
 PyTorch is no dependency of velfield: `pip install torch` before ``make detector``. The module is built from
 `network.TOPOLOGY`, the one definition of the layers, with two more outputs in its head, the logarithms of length and
-width: they are trained with the others, and are not yet part of the network that is written.
+width: by them the other layers learn what sizes are. The layer of sizes that is written is fitted afterwards
+(`tools.sizes`).
 
 Training starts from a network that knows cars already. Its layers are normalised by batch, with gains and offsets that
 leave the network as it was (`start_from`). A step takes 0.06 s of one core.
@@ -19,11 +20,12 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from schemas.arrays import Float32Array
-from velfield.detection.cnn.dataset import PATCH_PX, USUAL_SIZE_PX, Patch, PatchDataset, highest_gaussians, to_batch
+from velfield.detection.cnn.dataset import PATCH_PX, Patch, PatchDataset, highest_gaussians, to_batch
 from velfield.detection.cnn.model import find_peaks
 from velfield.detection.cnn.network import (
     STRIDE,
     TOPOLOGY,
+    USUAL_SIZE_PX,
     Conv,
     DepthToSpace,
     Layer,
@@ -165,7 +167,7 @@ def _convolutions(module: nn.Module) -> list[_Convolution]:
 
 
 def to_network(module: nn.Module) -> Network:
-    """The trained network for inference, without the sizes."""
+    """The trained network for inference, without a layer of sizes."""
     folded = {part.layer.name: part.folded() for part in _convolutions(module)}
     weights, biases = ({name: parts[k] for name, parts in folded.items()} for k in range(2))
     for arrays in (weights, biases):

@@ -1,9 +1,9 @@
 """Trains the shipped detectors: ``make detector DATA=FOLDER``, where the folder holds the sets of `training_data`.
 
-The network that ships is trained further on real pictures of those sets and on simulated cities; only weights go into
-the file. The score threshold and the reported accuracy are those of the parts of the sets that are held out, of
-which each counts alike, however many cars it shows. The file is written only where the new network is worse than the
-former one on none of them.
+The network that ships is trained further on real pictures of those sets and on simulated cities, and then the layer of
+sizes is fitted to it; only weights go into the file. The score threshold and the reported accuracy are those of the
+parts of the sets that are held out, of which each counts alike, however many cars it shows. The file is written only
+where the new network is worse than the former one on none of them.
 """
 
 from collections.abc import Sequence
@@ -14,12 +14,14 @@ import numpy as np
 from schemas.detector import CnnConfig
 from tools.training_data import (
     ATTRIBUTION,
+    Site,
     read_sites,
     read_swissimage_unlabelled,
 )
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record
+from velfield.detection.cnn.graph import network_to_record
 from velfield.detection.cnn.network import Network
 from velfield.detection.evaluation import HeldOutScores, f_measure, merge_scores, precision_recall_curve
 from velfield.detection.registry import shipped_detector
@@ -47,21 +49,23 @@ def make_shipped_detector(data: Path, out: Path, steps: int = STEPS) -> list[str
     The detector is written where its F1 is smaller than the former one's on no part.
     """
     from tools.pretraining import pretrain  # PyTorch, which the tests that read images with these tools need not have
+    from tools.sizes import fit_sizes
 
     former = shipped_detector()
     assert isinstance(former, CnnDetector)
     sites, simulated = read_sites(data), parallel_map(_simulate_city, SIMULATED_SEEDS)
+    groups, weights = _training_groups(sites, simulated)
     network = pretrain(
-        [*(site.training for site in sites), simulated],
-        [*(site.weight for site in sites), _SIMULATED_WEIGHT],
+        groups,
+        weights,
         start=former.network,
         seed=SEED,
         steps=steps,
         tiles=read_swissimage_unlabelled(data),
         tiles_from=steps * TILES_FROM // STEPS,
     )
-    held_out = {site.name: site.held_out for site in sites if site.held_out}
-    held_out["simulated cities"] = parallel_map(_simulate_city, SIMULATED_SEEDS_HELD_OUT)
+    network = fit_sizes(network, groups, weights, seed=SEED)
+    held_out = _held_out(sites)
     found = _evaluate(network, held_out)
     threshold = best_threshold(list(found.values()))
     count = sum(len(sample.cars) for site in sites for sample in site.training) + sum(len(s.cars) for s in simulated)
@@ -84,6 +88,38 @@ def make_shipped_detector(data: Path, out: Path, steps: int = STEPS) -> list[str
     record = make_record(network, threshold, curve, count, CnnConfig())
     CnnDetector(record.model_copy(update={"attribution": ATTRIBUTION})).save(out)
     return lines
+
+
+def fit_shipped_sizes(data: Path, out: Path) -> list[str]:
+    """Fit the layer of sizes to the network that ships, whose other layers and threshold stay as they are, and write
+    it; returns lines with the former and the new errors of the lengths on each held-out part."""
+    from tools.sizes import fit_sizes, size_errors
+
+    former = shipped_detector()
+    assert isinstance(former, CnnDetector)
+    sites = read_sites(data)
+    network = fit_sizes(
+        former.network, *_training_groups(sites, parallel_map(_simulate_city, SIMULATED_SEEDS)), seed=SEED
+    )
+    CnnDetector(former.record.model_copy(update={"onnx": network_to_record(network)})).save(out)
+    return [
+        f"{name}, {which}: {size_errors(one, samples)}"
+        for name, samples in _held_out(sites).items()
+        for which, one in (("former", former.network), ("new", network))
+    ]
+
+
+def _training_groups(
+    sites: Sequence[Site], simulated: Sequence[LabelledImage]
+) -> tuple[list[Sequence[LabelledImage]], list[float]]:
+    """Groups of images to train on, and their weights."""
+    return [*(site.training for site in sites), simulated], [*(site.weight for site in sites), _SIMULATED_WEIGHT]
+
+
+def _held_out(sites: Sequence[Site]) -> dict[str, Sequence[LabelledImage]]:
+    """Parts of the sets that are held out of training, by name."""
+    held_out = {site.name: site.held_out for site in sites if site.held_out}
+    return {**held_out, "simulated cities": parallel_map(_simulate_city, SIMULATED_SEEDS_HELD_OUT)}
 
 
 def _evaluate(network: Network, held_out: dict[str, Sequence[LabelledImage]]) -> dict[str, HeldOutScores]:

@@ -104,18 +104,21 @@ def read_boxes(file: Path) -> tuple[RGBImage, FloatArray]:
 def _shapes_of_upright(
     boxes: FloatArray, factor: float, shape: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Vehicles (n, 5), |angle| of their boxes (n,) and circles to ignore (k, 3), px of the picture."""
+    """Vehicles (n, 5), |angle| of their boxes (n,) and circles to ignore (k, 3), px of the picture.
+
+    Widths are NaN: lengths follow from a width that is assumed.
+    """
     vehicles, angles, ignore = [], [], []
     for kind, x, y, w, h in boxes:
         cut = min(x - w / 2, y - h / 2) < 1 or x + w / 2 > shape[1] - 2 or y + h / 2 > shape[0] - 2
         if kind == 0:
-            axis, length, width, angle = car_in_upright_box(w, h)
-            vehicles.append((x, y, axis, np.nan if cut else length, np.nan if cut else width))
+            axis, length, _, angle = car_in_upright_box(w, h)
+            vehicles.append((x, y, axis, np.nan if cut else length, np.nan))
             angles.append(angle)
         elif kind in (1, 2) and not cut:
-            length, width, angle = large_in_upright_box(w, h, _LARGE_WIDTH_RATIO * CAR_LENGTH_PX / factor)
+            length, _, angle = large_in_upright_box(w, h, _LARGE_WIDTH_RATIO * CAR_LENGTH_PX / factor)
             upright = min(angle, np.pi / 2 - angle) < 0.05
-            vehicles.append((x, y, round(angle / (np.pi / 2)) * np.pi / 2 if upright else np.nan, length, width))
+            vehicles.append((x, y, round(angle / (np.pi / 2)) * np.pi / 2 if upright else np.nan, length, np.nan))
             angles.append(np.nan if upright else angle)
         else:
             ignore.append((x, y, max(w, h, 2 * _IGNORE_RADIUS_PX / factor) / 2))

@@ -2,11 +2,11 @@
 
 python -m tests.benchmarks.vehicle_lengths [FIRST_SEED] [SEEDS] [--size 800x600] [--frames 12]
 
-Strips are cut from the frames at the true place of each visible vehicle, with a detector's error in position and axis,
-averaged over its track and measured as those of a run. What the detector misses is left out, as are what it takes for
-vehicles and the 2 % by which a run's lengths are too great (`tests.benchmarks.drone_clip` has them). Each seed has
-other cars, of a median length drawn about 4.45 m as those of places and decades differ. For each a --gsd-m that is
-right, and one that is wrong by 1.2 either way: then the strips are cut at that wrong scale.
+The network that ships measures each visible vehicle at its true place in each frame, with a detector's error in
+position; its track has the mean, as in a run. What the detector misses is left out, as are what it takes for vehicles
+and the ratio by which the lengths of moving vehicles are too great (`tests.benchmarks.drone_clip` has them). Each seed
+has other cars, of a median length drawn about 4.45 m as those of places and decades differ. For each a --gsd-m that is
+right, and one that is wrong by 1.2 either way: then vehicles are measured at that wrong scale.
 """
 
 import argparse
@@ -17,14 +17,15 @@ from schemas.arrays import FloatArray
 from schemas.scale import ScaleEstimate
 from schemas.simulation import SimulationConfig
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M, POPULATION_SD, TRACK_LENGTH_SD, estimate_vehicle_scale
-from velfield.detection.crops import oriented_strips
-from velfield.detection.frame import half_resolution
+from velfield.detection.cnn.detector import CnnDetector
+from velfield.detection.cnn.model import measure_vehicles
+from velfield.detection.registry import shipped_detector
 from velfield.pipeline.stages.labels import rescale
 from velfield.sources.scale import choose_scale
 from velfield.synthetic.flight import Flight
-from velfield.tracking.dimensions import STRIP_SHAPE, measure
+from velfield.tracking.dimensions import mean_dimensions
 
-_POSITION_SD_PX, _AXIS_SD_RAD = 0.7, 0.035
+_POSITION_SD_PX = 0.7
 """Of a detector, working px."""
 _WORKING_PX_PER_M = 4.0
 _MIN_FRAMES = 3
@@ -35,29 +36,23 @@ WRONG = (1.2, 1 / 1.2)
 def lengths_of(flight: Flight, gsd_m: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Measured lengths of the vehicles of a flight and their standard deviations, base px, the working grid's scale
     being that of ``gsd_m``."""
-    scale = _WORKING_PX_PER_M * gsd_m
-    total: dict[int, FloatArray] = {}
-    count: dict[int, int] = {}
+    scale, detector = _WORKING_PX_PER_M * gsd_m, shipped_detector()
+    assert isinstance(detector, CnnDetector)
+    sizes, vehicles = [], []
     for frame in range(flight.config.frames):
         cars = flight.cars(frame)
         cars = cars[cars["visible"]]
         raw = cars[["x_raw_px", "y_raw_px"]].to_numpy(np.float64)
-        ahead = cars[["x_base_px", "y_base_px"]].to_numpy() + np.column_stack(
-            [np.cos(cars["orientation_rad"]), np.sin(cars["orientation_rad"])]
-        )
-        step = flight.camera.to_raw(frame, ahead) - raw
-        axis = np.arctan2(step[:, 1], step[:, 0]) + rng.normal(0, _AXIS_SD_RAD, len(raw))
         limit = np.array([flight.config.width, flight.config.height]) - _MARGIN_PX
         inside = ((raw > _MARGIN_PX) & (raw < limit)).all(axis=1)
-        image = half_resolution(rescale(flight.frame(frame), scale))
+        image = rescale(flight.frame(frame), scale)
         xy = (raw + 0.5) * scale - 0.5 + rng.normal(0, _POSITION_SD_PX, raw.shape)
-        strips = oriented_strips(image, xy[inside], axis[inside])
-        for vehicle, strip in zip(cars["vehicle_id"].to_numpy()[inside].tolist(), strips, strict=True):
-            total[vehicle] = total.get(vehicle, np.zeros(STRIP_SHAPE)) + strip
-            count[vehicle] = count.get(vehicle, 0) + 1
-    seen = [vehicle for vehicle, frames in count.items() if frames >= _MIN_FRAMES]
-    size = measure(np.array([total[vehicle] / count[vehicle] for vehicle in seen]).reshape(-1, *STRIP_SHAPE))
-    return size.length / scale, size.length_sd / scale
+        sizes.append(measure_vehicles(detector.predictor, image, xy[inside]))
+        vehicles.append(cars["vehicle_id"].to_numpy(np.int64)[inside])
+    ids, vehicle = np.unique(np.concatenate(vehicles), return_inverse=True)
+    length, _, log_sd, _, count = mean_dimensions(np.concatenate(sizes), vehicle, len(ids)).T
+    seen = count >= _MIN_FRAMES
+    return length[seen] / scale, (length * log_sd)[seen] / scale
 
 
 def estimate(seed: int, size: tuple[int, int], frames: int) -> tuple[float, int, dict[float, ScaleEstimate]]:

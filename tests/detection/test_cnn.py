@@ -8,12 +8,14 @@ import pytest
 
 from schemas.detector import CnnConfig
 from velfield.bench.scenes import simulated_image
+from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import fine_tune
 from velfield.detection.cnn.graph import network_from_record, network_to_record
 from velfield.detection.cnn.inference import Predictor, predict_heatmap
 from velfield.detection.cnn.model import detect_cars
 from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.trainer import Trainer
+from velfield.detection.detect import detect_frame, with_sizes
 from velfield.detection.registry import shipped_detector
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
@@ -32,7 +34,7 @@ def shipped() -> Network:
 def test_images_of_any_size_are_processed(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
     assert predict_heatmap(Predictor(shipped()), image)[0].shape == (-(-shape[0] // 2), -(-shape[1] // 2))
-    assert detect_cars(Predictor(shipped()), image, None).shape[1] == 5
+    assert detect_cars(Predictor(shipped()), image, None).shape[1] == 9
 
 
 def test_a_network_survives_its_record_at_half_precision() -> None:
@@ -73,3 +75,41 @@ def test_the_threshold_of_few_cars_is_shrunk_towards_the_pretrained_one() -> Non
     assert own.curve is not None
     assert own.curve.operating_point is not None
     assert own.curve.threshold[own.curve.operating_point] == pytest.approx(own.threshold, abs=0.03)
+
+
+def test_lengths_and_widths_are_those_of_the_vehicles() -> None:
+    scene = city(9504)
+    found = shipped_detector().detect(scene.image)
+    distance = np.hypot(*(found.xy[:, None] - scene.cars[None, :, :2]).transpose(2, 0, 1))
+    seen = np.flatnonzero(distance.min(axis=0) < 4)
+    assert len(seen) > 20
+    error = np.log(found.sizes[distance.argmin(axis=0)[seen], :2] / scene.cars[seen, 3:5])
+    assert (np.abs(np.median(error, axis=0)) < 0.1).all()
+    assert (np.median(np.abs(error), axis=0) < 0.12).all()
+    sd = found.sizes[distance.argmin(axis=0)[seen], 2:]
+    assert 0.6 < np.mean(np.abs(error) < 1.645 * sd) <= 1
+
+
+def test_a_vehicle_that_something_else_found_is_measured_as_if_the_network_had() -> None:
+    image = city(9504).image
+    found = shipped_detector().detect(image)
+    inner = ((found.xy > 48) & (found.xy < np.array(image.shape[::-1]) - 48)).all(axis=1)
+    unknown = replace(found, sizes=np.full((len(found), 4), np.nan))
+    measured = with_sizes(image, unknown)
+    assert inner.sum() > 10
+    assert np.quantile(np.abs(np.log(measured.sizes / found.sizes))[inner, :2], 0.9) < 0.05
+    assert with_sizes(image, found) is found
+    assert len(with_sizes(image, unknown.take(np.empty(0, np.int64)))) == 0
+
+
+def test_a_network_without_a_layer_of_sizes_detects_the_same_and_the_one_that_ships_measures() -> None:
+    """As velfield 1 wrote its files, and as fine-tuning leaves the network."""
+    network = network_from_record(network_to_record(Trainer.from_network(shipped()).network()))
+    assert shipped().measures
+    assert not network.measures
+    image = city(9504).image
+    wanted, found = (detect_cars(Predictor(one), image, None) for one in (shipped(), network))
+    np.testing.assert_array_equal(found[:, :5], wanted[:, :5])
+    assert np.isnan(found[:, 5:]).all()
+    record = shipped_detector().record.model_copy(update={"onnx": network_to_record(network)})
+    assert np.isfinite(detect_frame(image, None, CnnDetector(record)).sizes).all()

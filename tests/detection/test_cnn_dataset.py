@@ -188,7 +188,7 @@ def test_a_window_of_the_image_shows_what_the_whole_image_does(shape: tuple[int,
     rng = np.random.default_rng(7)
     sample = LabelledImage(rng.integers(0, 256, shape).astype(np.uint8), np.empty((0, 5)))
     for _ in range(100):
-        matrix = _random_similarity(sample, rng)
+        matrix = _random_similarity(sample, rng, 0.2)
         rows, columns, of_window = _source_window(matrix, shape)
         found, expected = (
             cv2.warpAffine(image.astype(np.float32), to_patch, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
@@ -283,7 +283,7 @@ def test_patches_are_centred_near_long_vehicles_more_often() -> None:
     image = np.zeros((400, 400), np.uint8)
     cars = np.array([[100.0, 100, 0, 16, 7], [300.0, 300, 0, 45, 9]])
     rng = np.random.default_rng(0)
-    matrices = [_random_similarity(sample(image, cars), rng, large_weight=5.0) for _ in range(400)]
+    matrices = [_random_similarity(sample(image, cars), rng, 0.2, large_weight=5.0) for _ in range(400)]
     inside = [(np.abs(cars[:, :2] @ m[:, :2].T + m[:, 2] - PATCH_PX / 2) < PATCH_PX / 2).all(axis=1) for m in matrices]
     of_car, of_bus = np.mean(inside, axis=0)
     assert of_bus > 2.5 * of_car

@@ -16,10 +16,10 @@ from velfield.detection.cnn.graph import network_from_onnx, network_to_onnx
 from velfield.detection.cnn.inference import HALO_PX, Predictor, predict_heatmap
 from velfield.detection.cnn.layers import conv2d, conv2d_backward, relu_backward
 from velfield.detection.cnn.network import (
+    LAYERS,
+    SIZE_STRIDE,
     STRIDE,
-    TOPOLOGY,
     Network,
-    convolutions,
 )
 from velfield.detection.cnn.trainer import Trainer
 from velfield.errors import InputError
@@ -35,7 +35,7 @@ def normal(*shape: int, seed: int = 0) -> Float32Array:
 def random_network(seed: int = 0) -> Network:
     """Random weights that keep the size of the activations, exact at half precision."""
     rng, weights, biases = np.random.default_rng(seed), {}, {}
-    for name, conv in convolutions(TOPOLOGY).items():
+    for name, conv in LAYERS.items():
         scale = np.sqrt(2 / (conv.shape[0] * conv.channels_in))
         weights[name] = rng.normal(0, scale, conv.shape).astype(np.float16).astype(np.float32)
         biases[name] = rng.normal(0, 0.1, conv.channels_out).astype(np.float16).astype(np.float32)
@@ -174,7 +174,8 @@ def test_forward_equals_the_network_written_out_with_scipy() -> None:
 def test_onnxruntime_equals_the_numpy_reference(shape: tuple[int, int, int]) -> None:
     network, images = random_network(1), grey(2, *shape)
     expected = Trainer.from_network(network).predict(images.astype(np.float32) / 255)
-    probability, orientation = Predictor(network)(images)
+    probability, orientation, size = Predictor(network)(images)
+    assert size.shape == (len(images), 4, shape[1] // SIZE_STRIDE, shape[2] // SIZE_STRIDE)
     np.testing.assert_allclose(probability, 1 / (1 + np.exp(-expected[..., 0])), atol=2e-5)
     np.testing.assert_allclose(orientation, expected[..., 1:].transpose(0, 3, 1, 2), atol=5e-4)
 
@@ -232,6 +233,7 @@ def test_tiles_do_not_show_in_the_heatmap(monkeypatch: pytest.MonkeyPatch, shape
     assert tiled[0].shape == (-(-shape[0] // 2), -(-shape[1] // 2))
     np.testing.assert_allclose(tiled[0], whole[0], atol=1e-5)
     np.testing.assert_allclose(tiled[1], whole[1], atol=1e-4)
+    np.testing.assert_allclose(tiled[2], whole[2], atol=1e-4)
 
 
 def test_a_network_crosses_processes_without_its_session() -> None:

@@ -150,8 +150,9 @@ def test_on_a_gpu_all_runs_in_floating_point_on_images_of_one_size(
     sessions.use_device("cpu")
     expected = predict_heatmap(in_floating_point(), whole)
     inner = np.s_[..., 48:102, 48:552]  # farther from the edge than the network sees
-    for of_gpu, plain in zip(found, expected, strict=True):
+    for of_gpu, plain in zip(found[:2], expected[:2], strict=True):
         np.testing.assert_allclose(of_gpu[inner], plain[inner], atol=1e-4)
+    np.testing.assert_allclose(found[2][:, 24:51, 24:276], expected[2][:, 24:51, 24:276], atol=1e-4)
 
 
 @pytest.mark.parametrize(

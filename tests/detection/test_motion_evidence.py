@@ -43,7 +43,7 @@ def test_kharkiv(footage: Callable[[str], Path], tmp_path: Path) -> None:
     assert found["moving"] >= found_alone["moving"] + 0.05
     assert found["moving"] > 0.88
     assert found["standing"] >= found_alone["standing"]
-    assert sure >= precision + 0.13  # without what is doubtful: roof gear, leaves, and 2 to 5 of 53 parked cars
+    assert sure >= precision + 0.09  # without what is doubtful: roof gear, leaves, and 2 to 5 of 53 parked cars
     assert found_sure["moving"] >= found["moving"] - 0.03
     assert found_sure["standing"] >= found["standing"] - 0.1
 

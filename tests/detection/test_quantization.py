@@ -33,20 +33,22 @@ def shipped() -> CnnDetector:
 @pytest.mark.usefixtures("exact")
 def test_eight_bits_give_nearly_the_heatmap_of_floating_point() -> None:
     network, image = shipped().network, cars()[None]
-    wanted, axes = Predictor(network)(image)
-    found, found_axes = Predictor(network, calibrate(network, [cars(1), cars(2)]))(image)
+    wanted, axes, sizes = Predictor(network)(image)
+    found, found_axes, found_sizes = Predictor(network, calibrate(network, [cars(1), cars(2)]))(image)
     at = wanted > 0.2
     assert at.sum() > 100
     assert not np.array_equal(wanted, found)
     assert np.sqrt(np.mean((wanted - found)[at] ** 2)) < 0.03
     assert np.median(np.abs(axes - found_axes)[0, :, at[0]]) < 0.05
+    at_sizes = at[0].reshape(52, 2, 76, 2).any(axis=(1, 3))
+    assert np.median(np.abs(sizes - found_sizes)[0, :2, at_sizes]) < 0.02
 
 
 @pytest.mark.usefixtures("exact")
 def test_a_network_of_random_weights_is_near_to_floating_point() -> None:
     network = random_network(3)
-    wanted, _ = Predictor(network)(cars()[None])
-    found, _ = Predictor(network, calibrate(network, [cars(1)], crops=16))(cars()[None])
+    wanted, *_ = Predictor(network)(cars()[None])
+    found, *_ = Predictor(network, calibrate(network, [cars(1)], crops=16))(cars()[None])
     assert np.ptp(wanted) > 0.9
     assert np.sqrt(np.mean((wanted - found) ** 2)) < 0.02
 
@@ -71,19 +73,24 @@ def test_of_long_crops_of_one_size_each_is_predicted() -> None:
         np.testing.assert_array_equal(together[0][part], alone[0][part])
         assert alone[0][part].any()
         np.testing.assert_array_equal(together[1][:, *part], alone[1][:, *part])
+        part = slice(y // 4, (y + height) // 4), slice(x // 4, (x + width) // 4)
+        np.testing.assert_array_equal(together[2][:, *part], alone[2][:, *part])
 
 
 def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
     network, image = shipped().predictor, cars(2, (120, 160))
     crops = np.array([(0, 0, 48, 32), (0, 32, 48, 32), (48, 8, 64, 112), (0, 80, 48, 48)])
     probability, orientation = np.zeros((60, 80), np.float32), np.zeros((2, 60, 80), np.float32)
+    sizes = np.zeros((4, 30, 40), np.float32)
     for y, x, height, width in crops:
         part = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)
         alone = network(image[None, y : y + height, x : x + width])
         probability[part], orientation[:, *part] = alone[0][0], alone[1][0]
+        sizes[:, y // 4 : (y + height) // 4, x // 4 : (x + width) // 4] = alone[2][0]
     found = predict_crops(network, image, crops)
     np.testing.assert_allclose(found[0], probability, atol=1e-5)
     np.testing.assert_allclose(found[1], orientation, atol=1e-5)
+    np.testing.assert_allclose(found[2], sizes, atol=1e-5)
     assert not found[0][:, 64:].any()
 
 
@@ -114,7 +121,7 @@ def test_a_processor_that_saturates_takes_floating_point_and_says_so(monkeypatch
     detector = shipped().for_flight([cars(1)], CnnConfig())
     assert (detector.notes, detector.limitations) == ([INEXACT], [])
     with pytest.warns(RuntimeWarning, match="VNNI"):
-        found, _ = detector.predictor(cars()[None])
+        found, *_ = detector.predictor(cars()[None])
     np.testing.assert_array_equal(found, shipped().predictor(cars()[None])[0])
 
 

@@ -7,20 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.arrays import FloatArray, GreyImage
+from schemas.arrays import GreyImage
 from tools.training_data import read_boxes
 from velfield.bench.scenes import simulated_image
 from velfield.detection.registry import shipped_detector
 from velfield.detection.scale_search import STEP, View, find_scale, is_plausible_scale, spread_windows
 from velfield.pipeline.stages.labels import rescale
-from velfield.tracking.dimensions import measure
 
 SCALES = 0.1 * STEP ** np.arange(17)
-
-
-def measure_px(strips: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    size = measure(strips)
-    return size.length, size.length_sd, size.width
 
 
 def search(image: GreyImage) -> float | None:
@@ -29,7 +23,7 @@ def search(image: GreyImage) -> float | None:
             resampled = rescale(image[y : y + height, x : x + width], scale)
             yield resampled, np.ones(resampled.shape, bool)
 
-    return find_scale(views, shipped_detector(), SCALES, measure_px)
+    return find_scale(views, shipped_detector(), SCALES)
 
 
 @pytest.mark.parametrize(("seed", "factor"), [(951, 1.0), (952, 0.75), (953, 1.3)])
@@ -63,7 +57,7 @@ def test_only_the_right_scale_is_plausible() -> None:
     image = simulated_image(951).image
     images = [rescale(image, factor) for factor in (0.25, 1.0, 4.0)]
     views = [[(one, np.ones(one.shape, bool))] for one in images]
-    assert [is_plausible_scale(one, shipped_detector(), measure_px) for one in views] == [False, True, False]
+    assert [is_plausible_scale(one, shipped_detector()) for one in views] == [False, True, False]
 
 
 def test_no_scale_is_found_without_cars() -> None:

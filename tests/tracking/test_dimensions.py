@@ -1,33 +1,29 @@
-"""Dimensions of vehicles from strips along their axes, and classes from dimensions."""
+"""Dimensions of tracks by those of their detections, and classes from dimensions."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from tools.train_dimensions import Strips
 from velfield.analysis.vehicle_classes import CLASS_NAMES, add_dimensions, classify
-from velfield.tracking.dimensions import direction_of_axes, measure, sample_tracks
+from velfield.tracking.dimensions import direction_of_axes, mean_dimensions, sample_tracks
 
 
-def test_dimensions_of_drawn_vehicles_are_right_within_their_standard_deviations() -> None:
-    maker = Strips(seed=902)
-    drawn = [maker.draw() for _ in range(120)]
-    found = measure(np.stack([strip for strip, _ in drawn]))
-    length, width = np.stack([size for _, size in drawn]).T
-    for size, value, sd in ((length, found.length, found.length_sd), (width, found.width, found.width_sd)):
-        relative = (value - size) / size
-        assert abs(np.median(relative)) < 0.03
-        assert np.median(np.abs(relative)) < 0.09
-        assert 0.8 < np.mean(np.abs(value - size) < 1.645 * sd) <= 0.98
-    assert np.corrcoef(length, found.length)[0, 1] > 0.93
+def test_a_track_has_the_mean_of_its_detections_by_their_standard_deviations() -> None:
+    sizes = np.array([[16, 7, 0.05, 0.05], [17, 7.5, 0.05, 0.05], [40, 16, 0.05, 0.05], [18, 8, 0.5, 0.5]])
+    track = np.array([0, 0, 2, 2])
+    found = mean_dimensions(sizes, track, 3)
+    assert found[0, :2] == pytest.approx([np.sqrt(16 * 17), np.sqrt(7 * 7.5)])
+    assert found[2, 0] == pytest.approx(40, rel=0.05)  # the other one says itself that it is not sure
+    assert found[:, 4].tolist() == [2, 0, 2]
+    assert np.isnan(found[1, :4]).all()
+    assert 0.05 / np.sqrt(2) < found[0, 2] < 0.05  # the errors of one vehicle's detections are not independent
 
 
-def test_a_strip_the_other_way_round_and_darker_gives_the_same() -> None:
-    strip, _ = Strips(seed=903).draw()
-    one = measure(strip[None])
-    for other in (strip[::-1], strip[:, ::-1], strip - 20.0):
-        assert measure(other[None]).length == pytest.approx(one.length, rel=1e-6)
-    assert len(measure(np.empty((0, 32, 10))).width) == 0
+def test_a_detection_of_another_vehicle_hardly_changes_a_track() -> None:
+    sizes = np.tile([16.0, 7.0, 0.07, 0.07], (9, 1))
+    sizes[4, :2] = 45, 10
+    found = mean_dimensions(sizes, np.zeros(9, np.int64), 1)
+    assert found[0, 0] == pytest.approx(16, rel=0.02)
 
 
 def test_strips_are_spread_over_a_track_and_turned_along_its_heading() -> None:

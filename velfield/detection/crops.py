@@ -52,7 +52,12 @@ def _grid_kernel(
 
 def upright_chips(image: GreyImage, xy: FloatArray) -> GreyImage:
     """Crops about the rounded positions, (n, 32, 32) uint8: pixel (16, 16) is the rounded position."""
-    return np.asarray(_chips_kernel(image, np.rint(xy).astype(np.int64) - CHIP_PX // 2, CHIP_PX))
+    return crops_at(image, np.rint(xy).astype(np.int64) - CHIP_PX // 2, CHIP_PX)
+
+
+def crops_at(image: GreyImage, corners: IntArray, side_px: int) -> GreyImage:
+    """Crops (n, side, side) uint8 whose first pixels are at (n, 2): x, y; beyond the image its edge goes on."""
+    return np.asarray(_chips_kernel(image, corners, side_px))
 
 
 @kernel

@@ -12,14 +12,15 @@ slow bus looks the same before and after.
 
 The image is on the working grid: the base image's grid, scaled so that a car is ``working_car_length_px`` long. The
 crops (`attach_crops`) are patches rotated to the axis, to compare appearance, upright chips, to align, and strips at
-half the resolution along the axis, to measure vehicles up to the length of a bus.
+half the resolution along the axis, to compare vehicles up to the length of a bus. Detections of a detector that does
+not measure vehicles are measured by the network that ships (`with_sizes`).
 
 Candidates of a lower score than a detection's are kept apart (`SearchedFrame.weak`): where a track shows that a vehicle
 must be, they are enough evidence of it, as in the second association of ByteTrack (Zhang and others 2022).
 """
 
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -35,11 +36,15 @@ from velfield.detection.changes import (
     changed_kernel,
     difference_kernel,
 )
+from velfield.detection.cnn.detector import CnnDetector
+from velfield.detection.cnn.inference import Predictor
+from velfield.detection.cnn.model import VIEW_REACH_PX, measure_vehicles
 from velfield.detection.crops import CHIP_PX, oriented_patches, oriented_strips, upright_chips
 from velfield.detection.frame import SearchableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.mosaic import CROP_UNIT_PX, find_in_boxes
 from velfield.detection.nms import nms_oriented
+from velfield.detection.registry import shipped_detector
 
 _SLOW_PX = 96
 """Side of the boxes over which a difference counts as illumination."""
@@ -79,9 +84,26 @@ class FrameDetections(Detections):
         return FrameDetections(**{one.name: getattr(self, one.name)[mask] for one in fields(self)})
 
 
+def with_sizes(image: GreyImage, cars: Detections) -> Detections:
+    """Detections in an image, those without sizes measured by the network that ships."""
+    unknown = np.flatnonzero(np.isnan(cars.sizes).any(axis=1))
+    if not len(unknown):
+        return cars
+    sizes = cars.sizes.copy()
+    sizes[unknown] = measure_vehicles(_shipped_predictor(), image, cars.xy[unknown])
+    return replace(cars, sizes=sizes)
+
+
+@cache
+def _shipped_predictor() -> Predictor:
+    detector = shipped_detector()
+    assert isinstance(detector, CnnDetector)
+    return detector.predictor
+
+
 def detect_frame(image: GreyImage, valid: Mask | None, detector: Detector) -> FrameDetections:
     """Detect the cars of a frame, top to bottom; the parameters are those of `Detector.detect`."""
-    cars = detector.detect(image, valid)
+    cars = with_sizes(image, detector.detect(image, valid))
     order = np.lexsort((cars.xy[:, 0], cars.xy[:, 1]))
     return attach_crops(image, cars, order)
 
@@ -98,6 +120,7 @@ def attach_crops(
         orientation_sd_rad=cars.orientation_sd_rad[order],
         area_px=cars.area_px[order],
         score=cars.score[order],
+        sizes=cars.sizes[order],
         patches=oriented_patches(image, xy, axis),
         chips=upright_chips(image, xy),
         strips=oriented_strips(half, xy, axis),
@@ -166,6 +189,9 @@ def search_frame(
     above = found.score > own if detector.weak_margin else np.ones(len(found), bool)
     kept = None if reference is None else _outside(reference.detections, searched, frame.half_valid)
     cars = detector.refine(found.take(np.flatnonzero(above)), kept)
+    unknown = np.isnan(cars.sizes).any(axis=1)
+    frame.resample(_cells_of_crops(cars.xy[unknown], cells.shape, VIEW_REACH_PX), CELL_PX)
+    cars = with_sizes(frame.image, cars)
     weak = found.take(np.flatnonzero(~above))
     if reference is not None:
         weak = concatenate([weak, _outside(reference.weak, searched, frame.half_valid)])
@@ -191,11 +217,11 @@ def _grow(cells: Mask, reach: int) -> Mask:
     return np.asarray(cv2.dilate(cells.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
-def _cells_of_crops(xy: FloatArray, shape: tuple[int, ...]) -> Mask:
-    """Cells (rows, columns) that the crops about positions reach into."""
+def _cells_of_crops(xy: FloatArray, shape: tuple[int, ...], reach_px: int = CHIP_PX // 2) -> Mask:
+    """Cells (rows, columns) that crops about positions reach into, by default the chips."""
     cells = np.zeros(shape, bool)
     cells[_locate_cells(xy, shape)] = True
-    return _grow(cells, -(-CHIP_PX // (2 * CELL_PX)))
+    return _grow(cells, -(-reach_px // CELL_PX))
 
 
 def changed_cells(frame: SearchableFrame, reference: SearchableFrame, slope: Float32Array | None = None) -> Mask:

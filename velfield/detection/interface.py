@@ -34,6 +34,8 @@ class Detections:
     orientation_sd_rad : (n,) its standard deviation.
     area_px : (n,) working px^2.
     score : (n,) above the score threshold.
+    sizes : (n, 4) length and width, working px, and the standard deviations of their logarithms; NaN where the detector
+        does not measure them.
     """
 
     xy: FloatArray
@@ -41,26 +43,34 @@ class Detections:
     orientation_sd_rad: FloatArray
     area_px: FloatArray
     score: FloatArray
+    sizes: FloatArray
 
     @classmethod
-    def from_rows(cls, rows: FloatArray, area_px: FloatArray) -> "Detections":
-        """Detections from rows (n, 5) of x, y, axis, score, standard deviation of the axis, and from areas (n,)."""
-        return cls(rows[:, :2], rows[:, 2], rows[:, 4], area_px, rows[:, 3])
+    def from_rows(cls, rows: FloatArray, area_px: FloatArray, sizes: FloatArray | None = None) -> "Detections":
+        """Detections from rows (n, 5) of x, y, axis, score, standard deviation of the axis, from areas (n,) and sizes;
+        None: not measured."""
+        sizes = np.full((len(rows), 4), np.nan) if sizes is None else sizes
+        return cls(rows[:, :2], rows[:, 2], rows[:, 4], area_px, rows[:, 3], sizes)
+
+    @classmethod
+    def from_all(cls, rows: FloatArray) -> "Detections":
+        """Inverse of `to_rows`."""
+        return cls.from_rows(rows[:, :5], rows[:, 5], rows[:, 6:10])
 
     def to_rows(self) -> FloatArray:
-        """Rows (n, 6): those of `from_rows`, and the area."""
-        rows = np.empty((len(self), 6))
+        """Rows (n, 10): those of `from_rows`, the area and the sizes."""
+        rows = np.empty((len(self), 10))
         self._fill(rows)
         return rows
 
     def _fill(self, rows: FloatArray) -> None:
         rows[:, :2], rows[:, 2], rows[:, 3] = self.xy, self.orientation_rad, self.score
-        rows[:, 4], rows[:, 5] = self.orientation_sd_rad, self.area_px
+        rows[:, 4], rows[:, 5], rows[:, 6:] = self.orientation_sd_rad, self.area_px, self.sizes
 
     def take(self, rows: IntArray) -> "Detections":
         """Some of them, in the order given."""
         of_axis = self.orientation_rad[rows], self.orientation_sd_rad[rows]
-        return Detections(self.xy[rows], *of_axis, self.area_px[rows], self.score[rows])
+        return Detections(self.xy[rows], *of_axis, self.area_px[rows], self.score[rows], self.sizes[rows])
 
     def shifted(self, x: float, y: float) -> "Detections":
         """Detections of a crop whose first corner is at (x, y), in pixels of the whole image."""
@@ -72,11 +82,11 @@ class Detections:
 
 def concatenate(parts: Sequence[Detections]) -> Detections:
     """All of several parts, in their order."""
-    rows, start = np.empty((sum(map(len, parts)), 6)), 0
+    rows, start = np.empty((sum(map(len, parts)), 10)), 0
     for part in parts:
         part._fill(rows[start : start + len(part)])
         start += len(part)
-    return Detections.from_rows(rows[:, :5], rows[:, 5])
+    return Detections.from_all(rows)
 
 
 @dataclass(frozen=True)

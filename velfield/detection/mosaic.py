@@ -122,7 +122,7 @@ def _find_in_mosaic(
     shift = (corners - placed[:, :2])[crop]
     cars = found.to_rows()
     cars[:, :2] += shift[:, ::-1]
-    return Detections.from_rows(cars[:, :5], cars[:, 5]), mosaic.numbers[crop]
+    return Detections.from_all(cars), mosaic.numbers[crop]
 
 
 @kernel

@@ -13,8 +13,6 @@ import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, Mask
 from schemas.detector import DetectorConfig
-from velfield.detection.crops import oriented_strips
-from velfield.detection.frame import half_resolution
 from velfield.detection.interface import Detector
 from velfield.parallel import parallel_map
 
@@ -26,11 +24,14 @@ _COLUMNS, _ROWS = 3, 2
 """Windows of an image that is larger than that."""
 _TOP = 20
 """Detections whose scores count for the agreement, the highest."""
-_LENGTHS, _WIDTHS, _MAX_SD = (0.8, 1.5), (0.31, 0.62), 0.13
-"""Length and width of a car, in units of `working_car_length_px`; largest relative deviation of a measured length."""
-_LENGTH_BIAS = 1.027
-"""Ratio of the median measured length to the true one at the right scale, on KIT AIS, minsk, songdo and six simulated
-cities; 1.0 to 1.05 on all but one."""
+_LENGTHS, _WIDTHS, _MAX_SD = (0.8, 1.5), (0.31, 0.62), 0.18
+"""Length and width of a car, in units of `working_car_length_px`; largest standard deviation of the logarithm of a
+measured length."""
+_LENGTH_BIAS = 1.035
+"""Ratio of the median measured length to the true one near the right scale: 0.95 to 1.1 on KIT AIS, minsk, songdo,
+kharkiv and simulated cities."""
+_MIN_COUNTED = 3
+"""Cars at a scale of the scan: an image made very small has a high density by one false detection."""
 _MIN_DETECTIONS, _MIN_CARS = 12, 6
 """Of any size; of a car's size."""
 _MIN_AGREEMENT = 0.04
@@ -47,8 +48,6 @@ Views = Callable[[float, int], Iterable[View]]
 """Images and where they are valid, (h, w) each, resampled by a factor, of some total area in px of these."""
 Window = tuple[int, int, int, int]
 """x, y, width, height."""
-Measure = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
-"""Lengths, their standard deviations and widths (n,) by strips (n, 32, 10), px of the image."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class _Finds:
     ----------
     count : of any size.
     agreement : mean of the highest scores times the fraction that has the size of a car.
-    density : sum of the scores of those of the size of a car, per megapixel.
+    density : sum of the scores of those of the size of a car, per megapixel; 0 of fewer than `_MIN_COUNTED`.
     length_px : (n,) of those of the size of a car.
     """
 
@@ -74,7 +73,7 @@ class _Finds:
         return self.count >= _MIN_DETECTIONS and len(self.length_px) >= _MIN_CARS and self.agreement >= _MIN_AGREEMENT
 
 
-def find_scale(views: Views, detector: Detector, scales: FloatArray, measure: Measure) -> float | None:
+def find_scale(views: Views, detector: Detector, scales: FloatArray) -> float | None:
     """Scale at which the median car is of the detector's length.
 
     Parameters
@@ -82,11 +81,9 @@ def find_scale(views: Views, detector: Detector, scales: FloatArray, measure: Me
     views
         Parts of the image.
     detector
-        Its record has `working_car_length_px`.
+        It measures vehicles, and its record has `working_car_length_px`.
     scales
         (n,) factors to try, ascending by `STEP`.
-    measure
-        Measures vehicles on strips along their axes.
 
     Returns
     -------
@@ -94,7 +91,7 @@ def find_scale(views: Views, detector: Detector, scales: FloatArray, measure: Me
     """
     if not len(scales):
         return None
-    density = np.array([_search(views(float(scale), SCAN_PX), detector, measure).density for scale in scales])
+    density = np.array([_search(views(float(scale), SCAN_PX), detector).density for scale in scales])
     best = int(density.argmax())
     apart = np.abs(np.arange(len(scales)) - best) > 2
     if density[best] <= _MIN_RATIO * density[apart].max(initial=0.0):
@@ -102,7 +99,7 @@ def find_scale(views: Views, detector: Detector, scales: FloatArray, measure: Me
     beside = slice(max(best - 1, 0), best + 2)
     scale = float(np.exp(np.average(np.log(scales[beside]), weights=density[beside] ** 2)))
     for _ in range(2):
-        found = _search(views(scale, REFINE_PX), detector, measure)
+        found = _search(views(scale, REFINE_PX), detector)
         if not found.is_enough:
             return None
         factor = _LENGTH_BIAS * detector.record.working_car_length_px / float(np.median(found.length_px))
@@ -112,9 +109,9 @@ def find_scale(views: Views, detector: Detector, scales: FloatArray, measure: Me
     return scale
 
 
-def is_plausible_scale(views: Iterable[View], detector: Detector, measure: Measure) -> bool:
+def is_plausible_scale(views: Iterable[View], detector: Detector) -> bool:
     """Whether the detector finds cars of its size in images of one scale, as it does at the right one."""
-    found = _search(views, detector, measure)
+    found = _search(views, detector)
     return found.agreement >= _RIGHT_AGREEMENT and found.count >= _MIN_DETECTIONS
 
 
@@ -136,16 +133,15 @@ def spread_windows(width: int, height: int, area: float) -> list[Window]:
     return [(x, y, size[0], size[1]) for y in corners[1] for x in corners[0]]
 
 
-def _search(views: Iterable[View], detector: Detector, measure: Measure) -> _Finds:
-    """Detect cars in all views, and measure them."""
+def _search(views: Iterable[View], detector: Detector) -> _Finds:
+    """Detect and measure cars in all views."""
     car_px = float(detector.record.working_car_length_px)
 
     def find(view: View) -> tuple[int, FloatArray, FloatArray, Mask]:
         image, valid = view
         cars = detector.detect(image, valid)
-        strips = oriented_strips(half_resolution(image), cars.xy, cars.orientation_rad)
-        length, length_sd, width = measure(np.asarray(strips, np.float64))
-        is_car = length_sd < _MAX_SD * length
+        length, width, length_sd, _ = cars.sizes.T
+        is_car = length_sd < _MAX_SD
         for values, (low, high) in ((length, _LENGTHS), (width, _WIDTHS)):
             is_car &= (values > low * car_px) & (values < high * car_px)
         return int(valid.sum()), cars.score, length, np.asarray(is_car)
@@ -156,5 +152,6 @@ def _search(views: Iterable[View], detector: Detector, measure: Measure) -> _Fin
     if not len(score):
         return _Finds(0, 0.0, 0.0, length)
     agreement = float(np.sort(score)[-_TOP:].mean() * is_car.mean())
-    density = float(np.maximum(score, 0)[is_car].sum()) / area * 1e6
+    few = is_car.sum() < _MIN_COUNTED
+    density = 0.0 if few else float(np.maximum(score, 0)[is_car].sum()) / area * 1e6
     return _Finds(len(score), agreement, density, length[is_car])

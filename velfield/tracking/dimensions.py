@@ -1,42 +1,28 @@
-"""Length and width of vehicles, measured on strips along their axes, and the classes of vehicles that follow from them.
+"""Dimensions of vehicles by the sizes of their detections, and their looks by strips along their axes.
 
-A strip shows a vehicle whole, with its shadow, the road and its neighbours, at half the resolution
-(`velfield.detection.detect.oriented_strips`). A track's strips are averaged: the road that it passes blurs, the vehicle
-does not, and noise falls below the contrast of a black car and its shadow. A small network reads the mean of log length
-and log width and their standard deviations off it; it was trained on drawn vehicles (`tools/train_dimensions.py`).
+The network gives the length and the width of each detection, with their standard deviations. A track has the mean over
+its detections. A strip shows a vehicle whole, at half the resolution (`velfield.detection.crops.oriented_strips`). A
+track's strips are averaged: the road that it passes blurs, the vehicle does not.
 """
-
-from base64 import b64decode
-from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
-from itertools import pairwise
-from math import prod
 
 import numpy as np
 import pandas as pd
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from schemas.detector import DimensionsRecord
 
 STRIP_SHAPE = (32, 10)
 """Along and across the axis; a pixel is two working px."""
 _STRIPS = 16
 """Detections of a track that are averaged, spread over it."""
+_COMMON_VARIANCE = 0.5
+"""Fraction of a measurement's variance that all detections of a vehicle have in common, which more of them do not
+lessen."""
+_OUTLIER_SD = 1.5
+"""Standard deviations from the track's median beyond which a measurement counts less (Huber's weight)."""
 _END_STRIPS = 5
 """Detections at either end of a track that stand for its looks there."""
 _MIN_CONTRAST = 8.0
 """Grey levels: below it a strip is not stretched further, as it shows little but noise."""
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """Dimensions of vehicles, px of the strips' full resolution, and their standard deviations; (n,) each."""
-
-    length: FloatArray
-    length_sd: FloatArray
-    width: FloatArray
-    width_sd: FloatArray
 
 
 def normalise(strips: FloatArray) -> FloatArray:
@@ -48,43 +34,35 @@ def normalise(strips: FloatArray) -> FloatArray:
     return np.asarray((strips - road) / np.maximum(spread, _MIN_CONTRAST))
 
 
-def measure(strips: FloatArray) -> Dimensions:
-    """Dimensions of the vehicles of mean strips (n, 32, 10), grey levels.
+def mean_dimensions(sizes: FloatArray, track: IntArray, count: int) -> FloatArray:
+    """Dimensions of tracks by the sizes of some of their detections.
 
-    Each strip is read in the four orientations that its symmetries give. Their disagreement is part of the standard
-    deviation.
+    Parameters
+    ----------
+    sizes
+        (n, 4) length and width, px, and the standard deviations of their logarithms; finite.
+    track
+        (n,) index of the track of each, below ``count``.
+
+    Returns
+    -------
+    (count, 5) length and width, px, the standard deviations of their logarithms, and the number of detections; NaN
+    where there are none.
     """
-    if not len(strips):
-        return Dimensions(*np.empty((4, 0)))
-    upright = normalise(strips)
-    views = [upright[:, ::along, ::across] for along in (1, -1) for across in (1, -1)]
-    outputs = np.stack([_forward(view.reshape(len(view), -1)) for view in views])
-    mean, sd = outputs[..., :2], np.exp(np.clip(outputs[..., 2:], -5, 1))
-    log_size = mean.mean(axis=0)
-    log_sd = np.sqrt((sd**2).mean(axis=0) + mean.var(axis=0))
-    size = np.exp(log_size)
-    (length, width), (length_sd, width_sd) = size.T, (size * log_sd).T
-    return Dimensions(length, length_sd, width, width_sd)
+    logarithms, variance = np.log(sizes[:, :2]), sizes[:, 2:] ** 2
+    number = np.bincount(track, minlength=count).astype(np.float64)
+    median = pd.DataFrame(logarithms).groupby(track).median().reindex(range(count)).to_numpy(np.float64)
+    off = np.abs(logarithms - median[track])
+    weight = np.minimum(1.0, _OUTLIER_SD * np.sqrt(variance) / np.maximum(off, 1e-9)) / variance
 
+    def total(values: FloatArray) -> FloatArray:
+        return np.stack([np.bincount(track, values[:, k], count) for k in (0, 1)], axis=1)
 
-@cache
-def _layers() -> list[tuple[FloatArray, FloatArray]]:
-    text = files("velfield.tracking").joinpath("shipped_dimensions.json").read_text(encoding="utf-8")
-    record = DimensionsRecord.model_validate_json(text)
-    layers = []
-    for k, shape in enumerate(pairwise(record.widths)):
-        weights = np.frombuffer(b64decode(record.weights_f16[k]), "<f2", prod(shape)).astype(np.float64)
-        layers.append(
-            (weights.reshape(shape), np.frombuffer(b64decode(record.biases_f16[k]), "<f2").astype(np.float64))
-        )
-    return layers
-
-
-def _forward(x: FloatArray) -> FloatArray:
-    *hidden, (weights, biases) = _layers()
-    for w, b in hidden:
-        x = np.maximum(x @ w + b, 0)
-    return np.asarray(x @ weights + biases)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = total(weight * logarithms) / total(weight)
+        usual = total(weight * variance) / total(weight)
+        share = _COMMON_VARIANCE + (1 - _COMMON_VARIANCE) / number
+        return np.column_stack([np.exp(mean), np.sqrt(usual * share[:, None]), number])
 
 
 def sample_tracks(tracklets: pd.DataFrame) -> tuple[IntArray, pd.DataFrame]:

@@ -1,4 +1,5 @@
-"""Strips of vehicles along their axes, summed by track: dimensions, and the grey level in the middle."""
+"""Strips of vehicles along their axes, summed by track, and the sizes of their detections: dimensions, and the grey
+level in the middle."""
 
 from dataclasses import dataclass
 
@@ -6,20 +7,22 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
-from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, measure
+from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, mean_dimensions
 
 
 @dataclass(frozen=True)
 class StripSums:
     """Sums of the strips of each chain of tracklets, and their numbers: spread over it, at its start, at its end.
 
-    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,); ``scale``, working px a base px.
+    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,). ``sizes`` (n, 4) of the detections that are
+    spread over the chains, base px, as of `mean_dimensions`, and the ``chain`` (n,) of each, its index.
     """
 
     ids: IntArray
     total: Float32Array
     count: IntArray
-    scale: float
+    sizes: FloatArray
+    chain: IntArray
 
     def mean(self, which: int) -> FloatArray:
         """(chains, 32, 10); NaN where there are none."""
@@ -35,38 +38,14 @@ def along_headings(strips: ByteArray, axis_rad: FloatArray, heading_rad: FloatAr
     return found
 
 
-@dataclass(frozen=True)
-class TrackImages:
-    """Appearance of tracks, as far as known without reading frames.
-
-    ``ids`` (tracks,); ``strips`` (tracks, 32, 10), the means of ``count`` (tracks,) strips; ``scale``, working px
-    a base px.
-    """
-
-    ids: IntArray
-    strips: FloatArray
-    count: IntArray
-    scale: float
-
-
-def images_of_tracks(strips: StripSums, tracks: IntArray) -> TrackImages:
-    """Mean strips by track, of all chains of each; ``tracks`` (chains,)."""
+def measure_tracks(strips: StripSums, tracks: IntArray) -> pd.DataFrame:
+    """Dimensions by track (`DIMENSION_COLUMNS`), by the detections of all chains of each; ``tracks`` (chains,)."""
     ids, track = np.unique(tracks, return_inverse=True)
-    total, count = np.zeros((len(ids), *STRIP_SHAPE)), np.zeros(len(ids), np.int64)
-    for target, source in ((total, strips.total[0]), (count, strips.count[0])):
-        np.add.at(target, track, source)
-    seen = np.flatnonzero(count)
-    return TrackImages(ids[seen], total[seen] / count[seen, None, None], count[seen], strips.scale)
-
-
-def measure_tracks(images: TrackImages) -> pd.DataFrame:
-    """Dimensions by track (`DIMENSION_COLUMNS`)."""
-    found = measure(images.strips)
-    columns = {
-        name: getattr(found, name.removesuffix("_px")) / images.scale
-        for name in ("length_px", "length_sd_px", "width_px", "width_sd_px")
-    }
-    return pd.DataFrame({"track_id": images.ids, **columns, "strips": images.count})
+    found = mean_dimensions(strips.sizes, track[strips.chain], len(ids))
+    size, sd = found[:, :2], found[:, :2] * found[:, 2:4]
+    columns = {"length_px": size[:, 0], "length_sd_px": sd[:, 0], "width_px": size[:, 1], "width_sd_px": sd[:, 1]}
+    table = pd.DataFrame({"track_id": ids, **columns, "strips": found[:, 4].astype(np.int64)})
+    return table[table["strips"] > 0].reset_index(drop=True)
 
 
 def mean_grey(strips: StripSums, tracks: IntArray) -> pd.Series:
@@ -79,7 +58,6 @@ def mean_grey(strips: StripSums, tracks: IntArray) -> pd.Series:
 
 
 def certain_length(strips: StripSums) -> FloatArray:
-    """(chains,) px: the mean less a standard deviation; NaN where unknown."""
-    found = measure_tracks(images_of_tracks(strips, strips.ids)).set_index("track_id")
-    length = (found["length_px"] - found["length_sd_px"]).reindex(strips.ids)
-    return np.asarray(length, dtype=np.float64)
+    """(chains,) base px: the mean less a standard deviation; NaN where unknown."""
+    found = mean_dimensions(strips.sizes, strips.chain, len(strips.ids))
+    return np.asarray(found[:, 0] * (1 - found[:, 2]))

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from schemas.arrays import Float32Array, FloatArray, IntArray, Mask
-from velfield.detection.cnn.network import STRIDE
+from velfield.detection.cnn.network import STRIDE, USUAL_SIZE_PX
 from velfield.detection.cnn.trainer import Batch
 from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage
@@ -25,8 +25,6 @@ from velfield.detection.samples import LabelledImage
 PATCH_PX = 96
 """Side of a patch: six cars."""
 BATCH_SIZE = 16
-USUAL_SIZE_PX = 16.0, 7.2
-"""Length and width of a usual car, working px: of a vehicle whose label gives none."""
 HEATMAP_SIGMA_PX = 2.2
 """Standard deviation of a car's peak, and of any vehicle's across its axis. Along the axis it grows with the square
 root of the length, because the centre of a bus is less sharp; in pre-training only."""
@@ -87,12 +85,20 @@ class PatchDataset:
         Seed of all random numbers.
     hard
         Bring cars near to the tone of the road about them, and cut patches as the image's edge does: for pre-training.
+    log_scale_range
+        Greatest logarithm of the factor by which a patch is scaled, either way.
     """
 
     def __init__(
-        self, groups: Sequence[Sequence[LabelledImage]], weights: Sequence[float], seed: int, *, hard: bool = False
+        self,
+        groups: Sequence[Sequence[LabelledImage]],
+        weights: Sequence[float],
+        seed: int,
+        *,
+        hard: bool = False,
+        log_scale_range: float = _LOG_SCALE_RANGE,
     ) -> None:
-        self._hard = hard
+        self._hard, self._log_scale_range = hard, log_scale_range
         self._groups = [[_with_orientations(sample) for sample in group] for group in groups]
         self._probabilities = np.array(weights, float) / np.sum(weights)
         self._seed = seed
@@ -115,7 +121,8 @@ class PatchDataset:
         patches = []
         for _ in range(BATCH_SIZE):
             group = self._groups[rng.choice(len(self._groups), p=self._probabilities)]
-            patches.append(_sample_patch(group[rng.integers(len(group))], rng, hard=self._hard))
+            sample = group[rng.integers(len(group))]
+            patches.append(_sample_patch(sample, rng, hard=self._hard, log_scale_range=self._log_scale_range))
         return patches
 
 
@@ -128,8 +135,8 @@ def _with_orientations(sample: LabelledImage) -> LabelledImage:
     return replace(sample, cars=fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad))
 
 
-def _sample_patch(sample: LabelledImage, rng: np.random.Generator, *, hard: bool) -> Patch:
-    matrix = _random_similarity(sample, rng, large_weight=_LARGE_WEIGHT if hard else 1.0)
+def _sample_patch(sample: LabelledImage, rng: np.random.Generator, *, hard: bool, log_scale_range: float) -> Patch:
+    matrix = _random_similarity(sample, rng, log_scale_range, large_weight=_LARGE_WEIGHT if hard else 1.0)
     rows, columns, window_matrix = _source_window(matrix, sample.image.shape)
     image = sample.image[rows, columns].astype(np.float32)
     patch = cv2.warpAffine(image, window_matrix, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
@@ -189,7 +196,9 @@ def _cut_by_edge(patch: Float32Array, mask: Mask, rng: np.random.Generator) -> F
     return np.asarray(cut, np.float32)
 
 
-def _random_similarity(sample: LabelledImage, rng: np.random.Generator, *, large_weight: float = 1.0) -> FloatArray:
+def _random_similarity(
+    sample: LabelledImage, rng: np.random.Generator, log_scale_range: float, *, large_weight: float = 1.0
+) -> FloatArray:
     """Affine matrix (2, 3) from image to patch: centred near a car or anywhere, rotated, mirrored, scaled."""
     height, width = sample.image.shape
     if len(sample.cars) and rng.random() < _CENTRED_FRACTION:
@@ -201,7 +210,7 @@ def _random_similarity(sample: LabelledImage, rng: np.random.Generator, *, large
         centre = sample.cars[chosen, :2] + rng.normal(0, _CENTRING_SD_PX, 2)
     else:
         centre = rng.uniform(0, (width, height))
-    angle, scale = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(-_LOG_SCALE_RANGE, _LOG_SCALE_RANGE))
+    angle, scale = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(-log_scale_range, log_scale_range))
     c, s = scale * np.cos(angle), scale * np.sin(angle)
     linear = np.array([[c, -s], [s, c]]) * (rng.choice([-1.0, 1.0]), 1.0)
     return np.column_stack([linear, np.full(2, PATCH_PX / 2) - linear @ centre])

@@ -98,12 +98,12 @@ class CnnDetector(Detector):
         length_px = self.record.working_car_length_px
         rows = detect_cars(self.predictor, image, valid, border_px=border_px, crops=crops)
         above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)] if len(rows) else rows
-        return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT))
+        return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT), above[:, 5:])
 
     def refine(self, found: Detections, kept: Detections | None = None) -> Detections:
         """Non-maximum suppression."""
         rows = nms_oriented(super().refine(found, kept).to_rows(), self.record.working_car_length_px)
-        return Detections.from_rows(rows[:, :5], rows[:, 5])
+        return Detections.from_all(rows)
 
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:

@@ -129,7 +129,7 @@ def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> Label
     sample = replace(sample, cars=cars, abs_box_angle_rad=None)
     if sample.complete:
         return sample
-    probability, _ = predict_heatmap(Predictor(network), sample.image)
+    probability, *_ = predict_heatmap(Predictor(network), sample.image)
     likely = cv2.resize(probability, sample.image.shape[::-1]) > _UNLABELLED_MIN_PROBABILITY
     side = 2 * _UNLABELLED_MARGIN_PX + 1
     unlabelled = cv2.dilate(likely.astype(np.uint8), np.ones((side, side), np.uint8))

@@ -14,6 +14,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from schemas.arrays import Float32Array
 from velfield.detection.cnn.network import (
+    LAYERS,
+    SIZE_LAYER,
+    SIZE_SOURCE,
     TOPOLOGY,
     Conv,
     DepthToSpace,
@@ -31,8 +34,9 @@ def network_to_onnx(network: Network) -> bytes:
     """The network as an ONNX model with weights at half precision, which is what a detector file keeps.
 
     Input ``image``: (n, 1, h, w) uint8 grey, h and w multiples of `ALIGNMENT`. Outputs: ``probability``
-    (n, 1, h / 2, w / 2) of a car's centre and ``orientation`` (n, 2, h / 2, w / 2), cosine and sine of twice the
-    orientation. It is computed with at single precision.
+    (n, 1, h / 2, w / 2) of a car's centre, ``orientation`` (n, 2, h / 2, w / 2), cosine and sine of twice the
+    orientation, and ``size`` (n, 4, h / 4, w / 4), as of `SIZE_LAYER`, if the network has that layer. It is computed
+    with at single precision.
     """
     return serialize(network_graph(network, half=True))
 
@@ -53,6 +57,9 @@ def network_graph(network: Network, *, half: bool = False) -> onnx.GraphProto:
         "probability": ["n", 1, "h / 2", "w / 2"],
         "orientation": ["n", 2, "h / 2", "w / 2"],
     }
+    if network.measures:
+        graph.conv(SIZE_LAYER, graph.features)
+        sizes[SIZE_LAYER.name] = ["n", SIZE_LAYER.channels_out, "h / 4", "w / 4"]
     image, *outputs = (
         helper.make_tensor_value_info(name, TensorProto.UINT8 if name == "image" else TensorProto.FLOAT, size)
         for name, size in sizes.items()
@@ -61,11 +68,13 @@ def network_graph(network: Network, *, half: bool = False) -> onnx.GraphProto:
 
 
 class _GraphBuilder:
-    """Nodes and constants of an ONNX graph; every value has a name of its own."""
+    """Nodes and constants of an ONNX graph; every value has a name of its own. ``features`` is the output of
+    `SIZE_SOURCE`."""
 
     def __init__(self, network: Network, *, half: bool) -> None:
         self.network, self.half = network, half
-        self.blocks = _blocks(TOPOLOGY)
+        self.blocks = _blocks(TOPOLOGY) | {SIZE_LAYER.name: 1}
+        self.features = ""
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
@@ -90,6 +99,8 @@ class _GraphBuilder:
                 value = self.node("Add", [self.layers(layer.layers, value), value])
             if isinstance(layer, Conv | Residual) and layer.relu:
                 value = self.node("Relu", [value])
+            if isinstance(layer, Conv) and layer.name == SIZE_SOURCE:
+                self.features = value
         return value
 
     def conv(self, layer: Conv, value: str) -> str:
@@ -137,6 +148,8 @@ def _blocks(layers: Topology) -> dict[str, int]:
 def network_from_onnx(data: bytes) -> Network:
     """Read the weights of an ONNX model that `network_to_onnx` wrote.
 
+    One that was fine-tuned has no layer of sizes.
+
     Raises
     ------
     InputError
@@ -153,7 +166,8 @@ def network_from_onnx(data: bytes) -> Network:
             f"found a network that is no ONNX model ({type(error).__name__}), expected one as velfield writes it; "
             "train the detector again"
         ) from None
-    layers, blocks = convolutions(TOPOLOGY), _blocks(TOPOLOGY)
+    sized = any(name.startswith(f"{SIZE_LAYER.name}.") for name in found)
+    layers, blocks = LAYERS if sized else convolutions(TOPOLOGY), _blocks(TOPOLOGY) | {SIZE_LAYER.name: 1}
     shapes = {f"{name}.weight": _onnx_shape(layer, blocks[name]) for name, layer in layers.items()}
     shapes |= {f"{name}.bias": (layer.channels_out,) for name, layer in layers.items()}
     if any(name not in found or found[name].shape != shape for name, shape in shapes.items()):

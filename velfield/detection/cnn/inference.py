@@ -15,7 +15,7 @@ import onnxruntime as ort
 from schemas.arrays import ByteArray, Float32Array, GreyImage, IntArray
 from velfield.compiled import kernel
 from velfield.detection.cnn.graph import network_to_onnx
-from velfield.detection.cnn.network import ALIGNMENT, STRIDE, Network
+from velfield.detection.cnn.network import ALIGNMENT, SIZE_LAYER, SIZE_STRIDE, STRIDE, Network
 from velfield.detection.cnn.quantization import INEXACT, Ranges, is_exact, quantized_to_onnx
 from velfield.detection.runtime import (
     STARTING,
@@ -37,8 +37,8 @@ BORDER_PX = 16
 _BATCH_PX = 500_000
 """Pixels of the crops that the network is run on at once: more no longer stays in the processor's cache."""
 
-Heatmaps: TypeAlias = tuple[Float32Array, Float32Array]
-"""Probability of a car's centre, and cosine and sine of twice its orientation."""
+Heatmaps: TypeAlias = tuple[Float32Array, Float32Array, Float32Array]
+"""Probability of a car's centre, cosine and sine of twice its orientation, and its sizes as of `SIZE_LAYER`."""
 
 
 class Predictor:
@@ -77,9 +77,14 @@ class Predictor:
         return open_session(network_to_onnx(self.network), "cpu")
 
     def __call__(self, images: GreyImage) -> Heatmaps:
-        """Heatmaps (n, h / 2, w / 2) and vectors (n, 2, h / 2, w / 2) of images (n, h, w), multiples of `ALIGNMENT`."""
-        probability, orientation = self.session.run(None, {"image": np.ascontiguousarray(images[:, None])})
-        return probability[:, 0], orientation
+        """Heatmaps (n, h / 2, w / 2), vectors (n, 2, h / 2, w / 2) and sizes (n, 4, h / 4, w / 4) of images (n, h, w),
+        multiples of `ALIGNMENT`; sizes are NaN of a network that does not measure."""
+        probability, orientation, *size = self.session.run(None, {"image": np.ascontiguousarray(images[:, None])})
+        if not size:
+            count, height, width = images.shape
+            shape = count, SIZE_LAYER.channels_out, height // SIZE_STRIDE, width // SIZE_STRIDE
+            size = [np.full(shape, np.nan, np.float32)]
+        return probability[:, 0], orientation, size[0]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the session, which no other process can use."""
@@ -87,7 +92,7 @@ class Predictor:
 
 
 def predict_heatmap(predict: Predictor, image: GreyImage, *, border_px: int = BORDER_PX) -> Heatmaps:
-    """Probability and orientation of a car at each pixel of the heatmap, by tiled inference.
+    """Probability and orientation of a car at each pixel of the heatmap, and its sizes, by tiled inference.
 
     Parameters
     ----------
@@ -98,8 +103,8 @@ def predict_heatmap(predict: Predictor, image: GreyImage, *, border_px: int = BO
 
     Returns
     -------
-    (h / 2, w / 2) probability and (2, h / 2, w / 2) orientation vector, sizes rounded up; heatmap pixel (x, y) is
-    centred at (2 x + 0.5, 2 y + 0.5) of the image.
+    (h / 2, w / 2) probability, (2, h / 2, w / 2) orientation vector and (4, h / 4, w / 4) sizes, all rounded up;
+    heatmap pixel (x, y) is centred at (2 x + 0.5, 2 y + 0.5) of the image, a pixel of the sizes at 4 x + 1.5.
     """
     gpu = on_cuda(predict.session)
     border_px, unit = (HALO_PX, _GPU_TILE_PX) if gpu else (border_px, ALIGNMENT)
@@ -109,19 +114,30 @@ def predict_heatmap(predict: Predictor, image: GreyImage, *, border_px: int = BO
     padded = cv2.copyMakeBorder(image, border_px, end[0], border_px, end[1], cv2.BORDER_REFLECT_101)
     probability = np.empty((whole[0] // STRIDE, whole[1] // STRIDE), np.float32)
     orientation = np.empty((2, *probability.shape), np.float32)
+    sizes = np.empty((SIZE_LAYER.channels_out, whole[0] // SIZE_STRIDE, whole[1] // SIZE_STRIDE), np.float32)
     for y in range(0, whole[0], side[0]):
         for x in range(0, whole[1], side[1]):
             # Beside other tiles the halo, at the image's edge its border: so tiles do not show.
             top, left = max(0, y + border_px - HALO_PX), max(0, x + border_px - HALO_PX)
             tile = padded[top : y + border_px + side[0] + HALO_PX, left : x + border_px + side[1] + HALO_PX]
-            of_tile = predict(tile[None])
-            down, right = (y + border_px - top) // STRIDE, (x + border_px - left) // STRIDE
+            heatmaps, vectors, of_tile = predict(tile[None])
+            down, right = y + border_px - top, x + border_px - left
             rows, columns = min(side[0], whole[0] - y), min(side[1], whole[1] - x)
-            inner = slice(down, down + rows // STRIDE), slice(right, right + columns // STRIDE)
-            part = slice(y // STRIDE, (y + rows) // STRIDE), slice(x // STRIDE, (x + columns) // STRIDE)
-            probability[part], orientation[:, *part] = of_tile[0][0][inner], of_tile[1][0][:, *inner]
-    size = -(-image.shape[0] // STRIDE), -(-image.shape[1] // STRIDE)
-    return probability[: size[0], : size[1]], orientation[:, : size[0], : size[1]]
+            inner, part = _window(down, right, rows, columns, STRIDE), _window(y, x, rows, columns, STRIDE)
+            probability[part], orientation[:, *part] = heatmaps[0][inner], vectors[0][:, *inner]
+            inner, part = _window(down, right, rows, columns, SIZE_STRIDE), _window(y, x, rows, columns, SIZE_STRIDE)
+            sizes[:, *part] = of_tile[0][:, *inner]
+    height, width = image.shape
+    inside, at_sizes = (_window(0, 0, height, width, stride) for stride in (STRIDE, SIZE_STRIDE))
+    return probability[inside], orientation[:, *inside], sizes[:, *at_sizes]
+
+
+def _window(top: int, left: int, rows: int, columns: int, stride: int) -> tuple[slice, slice]:
+    """Part of a map of a pixel for every ``stride`` of an image: its window, ends rounded up."""
+    return (
+        slice(top // stride, -(-(top + rows) // stride)),
+        slice(left // stride, -(-(left + columns) // stride)),
+    )
 
 
 def predict_crops(predict: Predictor, image: GreyImage, crops: IntArray) -> Heatmaps:
@@ -143,6 +159,7 @@ def predict_crops(predict: Predictor, image: GreyImage, crops: IntArray) -> Heat
         return predict_heatmap(predict, image)
     probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
     orientation = np.zeros((2, *probability.shape), np.float32)
+    sizes = np.zeros((SIZE_LAYER.channels_out, *(-(-side // SIZE_STRIDE) for side in image.shape)), np.float32)
     for height, width in np.unique(crops[:, 2:], axis=0).tolist():
         corners = crops[(crops[:, 2:] == (height, width)).all(axis=1), :2]
         tiled = max(height, width) > _TILE_PX
@@ -151,12 +168,13 @@ def predict_crops(predict: Predictor, image: GreyImage, crops: IntArray) -> Heat
             some = corners[start : start + at_once]
             pixels = _cut_kernel(image, some, height, width)
             if tiled:
-                heatmap, vector = predict_heatmap(predict, pixels[0], border_px=0)
-                heatmaps, vectors = heatmap[None], vector[None]
+                heatmaps, vectors, of_crops = (part[None] for part in predict_heatmap(predict, pixels[0], border_px=0))
             else:
-                heatmaps, vectors = predict(pixels)
-            _place_kernel(heatmaps, vectors, some // STRIDE, probability, orientation)
-    return probability, orientation
+                heatmaps, vectors, of_crops = predict(pixels)
+            _place_kernel(heatmaps[:, None], some // STRIDE, probability[None])
+            _place_kernel(vectors, some // STRIDE, orientation)
+            _place_kernel(of_crops, some // SIZE_STRIDE, sizes)
+    return probability, orientation, sizes
 
 
 @kernel
@@ -173,19 +191,13 @@ def _cut_kernel(image: ByteArray, corners: IntArray, height: int, width: int) ->
 
 
 @kernel
-def _place_kernel(
-    heatmaps: Float32Array,
-    vectors: Float32Array,
-    corners: IntArray,
-    probability: Float32Array,
-    orientation: Float32Array,
-) -> None:
-    """Write the heatmaps and orientation vectors of crops where these lie (n, 2): y, x."""
-    height, width = heatmaps.shape[1:]
+def _place_kernel(maps: Float32Array, corners: IntArray, out: Float32Array) -> None:
+    """Write maps (n, channels, h, w) of crops where these lie (n, 2): y, x; ``out`` (channels, H, W)."""
+    channels, height, width = maps.shape[1:]
     for n in range(len(corners)):
         top, left = corners[n]
-        for row in range(height):
-            for x in range(width):  # one by one: numba compiles an assigned slice for seconds
-                probability[top + row, left + x] = heatmaps[n, row, x]
-                orientation[0, top + row, left + x] = vectors[n, 0, row, x]
-                orientation[1, top + row, left + x] = vectors[n, 1, row, x]
+        for channel in range(channels):
+            for row in range(height):
+                source, target = maps[n, channel, row], out[channel, top + row]
+                for x in range(np.uint64(width)):  # one by one: numba compiles an assigned slice for seconds
+                    target[np.uint64(left) + x] = source[x]

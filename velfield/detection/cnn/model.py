@@ -10,11 +10,14 @@ import numpy as np
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.compiled import kernel
 from velfield.detection.cnn.inference import BORDER_PX, Predictor, predict_crops, predict_heatmap
-from velfield.detection.cnn.network import STRIDE
+from velfield.detection.cnn.network import ALIGNMENT, SIZE_STRIDE, STRIDE, USUAL_SIZE_PX
+from velfield.detection.crops import crops_at
 
 SMOOTHING_SIGMA = 0.8
 """Standard deviation by which the heatmap is smoothed, in its pixels."""
 _LEAST_PROBABILITY = 1e-6
+_LOG_SIZES, _LOG_SD = (-2.0, 2.0), (-4.0, 1.0)
+"""Limits of the network's sizes, in logarithms: what a vehicle can be, and how sure training lets it be."""
 _SPAN = 64
 """Pixels of the heatmap that are searched for peaks, or are not, together."""
 _QUARTER_CAR_PX = 4.0
@@ -36,21 +39,54 @@ def detect_cars(
 
     Returns
     -------
-    (n, 5): x, y in working px, orientation (axial, [0, pi)), score (probability - `SCORE_OFFSET`), standard deviation
-    of the orientation, rad.
+    (n, 9): x, y in working px, orientation (axial, [0, pi)), score (probability - `SCORE_OFFSET`), standard deviation
+    of the orientation, rad, and the sizes of `read_sizes`.
     """
     if crops is None:
-        probability, orientation = predict_heatmap(predict, image, border_px=border_px)
+        probability, orientation, sizes = predict_heatmap(predict, image, border_px=border_px)
     else:
-        probability, orientation = predict_crops(predict, image, crops)
+        probability, orientation, sizes = predict_crops(predict, image, crops)
     peaks = find_peaks(probability, orientation, valid, stride=STRIDE, min_probability=_MIN_PEAK_PROBABILITY)
     if not len(peaks):
-        return np.empty((0, 5))
+        return np.empty((0, 9))
     resultant = np.clip(np.hypot(peaks[:, 2], peaks[:, 3]), 1e-3, 1 - 1e-3)
     axis = np.mod(0.5 * np.arctan2(peaks[:, 3], peaks[:, 2]), np.pi)
     sd = 0.5 * np.sqrt(-2 * np.log(resultant))
-    detections = np.column_stack([peaks[:, :2], axis, peaks[:, 4] - SCORE_OFFSET, sd])
+    of_peaks = read_sizes(sizes, peaks[:, :2])
+    detections = np.column_stack([peaks[:, :2], axis, peaks[:, 4] - SCORE_OFFSET, sd, of_peaks])
     return detections[are_mostly_visible(detections, image.shape, valid)]
+
+
+def read_sizes(sizes: Float32Array, xy: FloatArray) -> FloatArray:
+    """Sizes (n, 4) at positions (n, 2), working px: length and width, px, and the standard deviations of their
+    logarithms; ``sizes`` (4, h, w) as the network gives them."""
+    column, row = (np.floor((xy[:, k] + 0.5) / SIZE_STRIDE).astype(np.int64) for k in (0, 1))
+    found = sizes[:, np.clip(row, 0, sizes.shape[1] - 1), np.clip(column, 0, sizes.shape[2] - 1)].astype(np.float64).T
+    length_and_width = np.exp(np.clip(found[:, :2], *_LOG_SIZES)) * USUAL_SIZE_PX
+    return np.column_stack([length_and_width, np.exp(np.clip(found[:, 2:], *_LOG_SD))])
+
+
+_VIEW_PX, _VIEWS, VIEW_REACH_PX = 80, 64, 48
+"""Side of the views by which vehicles at known places are measured, views at once, and how far they reach from a
+vehicle. They begin at multiples of `ALIGNMENT`, so that the network's coarse pixels lie as in the whole image: lengths
+depend on where these lie."""
+
+
+def measure_vehicles(predict: Predictor, image: GreyImage, xy: FloatArray) -> FloatArray:
+    """Sizes (n, 4), as of `read_sizes`, of vehicles that something else found at positions (n, 2), working px.
+
+    Parameters
+    ----------
+    image
+        (h, w) uint8 on the working grid, known `VIEW_REACH_PX` about each position.
+    """
+    found = [np.empty((0, 4))]
+    for start in range(0, len(xy), _VIEWS):
+        some = xy[start : start + _VIEWS]
+        corners = (np.rint(some).astype(np.int64) - (_VIEW_PX - ALIGNMENT) // 2) // ALIGNMENT * ALIGNMENT
+        sizes = predict(crops_at(image, corners, _VIEW_PX))[2]
+        found += [read_sizes(one, at[None]) for one, at in zip(sizes, some - corners, strict=True)]
+    return np.concatenate(found)
 
 
 def find_peaks(

@@ -90,6 +90,14 @@ TOPOLOGY: Topology = (
 resolution: 19.8 GMAC a frame of 2560 x 1920."""
 STRIDE = 2
 """Working px a pixel of the heatmap."""
+SIZE_SOURCE, SIZE_LAYER = "dec1", Conv("size", 1, 32, 4, relu=False)
+"""A layer of its own on the output of another layer: the logarithms of length and width over `USUAL_SIZE_PX`, and the
+logarithms of their standard deviations. It is fitted to a network that detects (`tools.sizes`), and leaves the
+detections as they are."""
+SIZE_STRIDE = 4
+"""Working px a pixel of the sizes."""
+USUAL_SIZE_PX = 16.0, 7.2
+"""Length and width of a usual car, working px."""
 ALIGNMENT = 16
 """Height and width of an image must be multiples of this: two to the number of halvings."""
 
@@ -105,9 +113,13 @@ def convolutions(layers: Topology) -> dict[str, Conv]:
     return found
 
 
+LAYERS = convolutions(TOPOLOGY) | {SIZE_LAYER.name: SIZE_LAYER}
+"""All layers that have weights, by name."""
+
+
 @dataclass(frozen=True)
 class Network:
-    """Weights of a trained network of `TOPOLOGY`.
+    """Weights of a trained network: of `TOPOLOGY`, and perhaps of `SIZE_LAYER`.
 
     Attributes
     ----------
@@ -117,3 +129,8 @@ class Network:
 
     weights: Mapping[str, Float32Array]
     biases: Mapping[str, Float32Array]
+
+    @property
+    def measures(self) -> bool:
+        """Whether it has the layer that gives lengths and widths."""
+        return SIZE_LAYER.name in self.weights

@@ -60,7 +60,9 @@ def calibrate(
         pixels.append(image[y : y + side, x : x + side])
     graph = network_graph(network)
     names = [node.output[0] for node in graph.node if node.op_type in _OPERATORS]
-    graph.output.extend(helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in names)
+    known = {one.name for one in graph.output}
+    others = [name for name in names if name not in known]
+    graph.output.extend(helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in others)
     session = open_session(serialize(graph), "cpu")
 
     def ends_of_batch(start: int) -> list[NDArray[np.floating]]:

@@ -94,9 +94,10 @@ class Trainer:
 
     @classmethod
     def from_network(cls, network: Network) -> "Trainer":
-        """A trained network, for fine-tuning."""
-        parameters = {f"{name}.w": weights.copy() for name, weights in network.weights.items()}
-        parameters |= {f"{name}.b": biases.copy() for name, biases in network.biases.items()}
+        """A trained network, for fine-tuning; without its layer of sizes, which would not fit the others afterwards."""
+        names = convolutions(TOPOLOGY)
+        parameters = {f"{name}.w": network.weights[name].copy() for name in names}
+        parameters |= {f"{name}.b": network.biases[name].copy() for name in names}
         return cls(parameters)
 
     def network(self) -> Network:

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.arrays import FloatArray
 from schemas.scale import ScaleEstimate
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.detection.interface import Detector
@@ -16,7 +15,6 @@ from velfield.pipeline.result import advance
 from velfield.pipeline.stages.rectified_frames import WorkingGrid
 from velfield.pipeline.stages.registration import usable_frames
 from velfield.run.frame_transforms import read_own_grid
-from velfield.tracking.dimensions import measure
 
 _FRAMES = 3
 _GSD_RANGE_M = 0.02, 0.6
@@ -35,7 +33,7 @@ def search_scale(plan: Plan, detector: Detector) -> float | None:
     gsd_m = _GSD_RANGE_M[0] * STEP ** np.arange(np.log(_GSD_RANGE_M[1] / _GSD_RANGE_M[0]) / np.log(STEP))
     scales = detector.record.working_car_length_px / (CAR_LENGTH_M / gsd_m)
     scales = scales[scales**2 * grid.width_px * grid.height_px < _MAX_PX]
-    return find_scale(_views(plan), detector, scales, _measure_px)
+    return find_scale(_views(plan), detector, scales)
 
 
 def contradict_metadata(plan: Plan, metadata: ScaleEstimate) -> ScaleEstimate | None:
@@ -48,7 +46,7 @@ def contradict_metadata(plan: Plan, metadata: ScaleEstimate) -> ScaleEstimate | 
     car_px = float(detector.record.working_car_length_px)
     scale = car_px * metadata.gsd_m / CAR_LENGTH_M
     if scale**2 * grid.width_px * grid.height_px < _MAX_PX and is_plausible_scale(
-        _views(plan)(scale, REFINE_PX), detector, _measure_px
+        _views(plan)(scale, REFINE_PX), detector
     ):
         return None
     found = search_scale(plan, detector)
@@ -82,8 +80,3 @@ def _views(plan: Plan) -> Views:
         advance("detector", 0)
 
     return views
-
-
-def _measure_px(strips: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    size = measure(strips)
-    return size.length, size.length_sd, size.width

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, Mask, Points
 from schemas.tables import DETECTION_COLUMNS
-from velfield.detection.detect import FrameDetections, SearchedFrame, attach_crops, search_frame
+from velfield.detection.detect import FrameDetections, SearchedFrame, attach_crops, search_frame, with_sizes
 from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
 from velfield.detection.registry import load_detector
@@ -46,7 +46,7 @@ def external_detections(
     score, axis_sd = boxes["score"].to_numpy(np.float64), np.full(len(xy), _AXIS_SD_RAD)
     cars = np.column_stack([xy, np.mod(axis, np.pi), score, axis_sd])
     finite = np.isfinite(xy).all(axis=1)
-    return attach_crops(rectified.image, Detections.from_rows(cars[finite], area[finite]))
+    return attach_crops(rectified.image, with_sizes(rectified.image, Detections.from_rows(cars[finite], area[finite])))
 
 
 def _estimate_missing_axes(rectified: WorkingFrame, xy: Points, transform: FrameMap, boxes: pd.DataFrame) -> FloatArray:
@@ -79,7 +79,8 @@ class Cars:
     Attributes
     ----------
     column : of the table, (n,) each, by name.
-    crops : patches, chips and strips, and positions on the working grid, by name: a part a frame, after an empty one;
+    crops : patches, chips and strips, positions on the working grid and sizes, by name: a part a frame, after an empty
+        one;
         of weak candidates `_WEAK_CROPS`.
         They are not put together, as what is written is most of all that a block gives.
     """
@@ -257,8 +258,9 @@ _NO_CROPS: dict[str, NDArray[Any]] = {
     "chips": np.empty((0, 32, 32), np.uint8),
     "strips": np.empty((0, 32, 10), np.uint8),
     "xy_work": np.empty((0, 2)),
+    "sizes": np.empty((0, 4), np.float32),
 }
-_WEAK_CROPS = ("chips", "strips", "xy_work")
+_WEAK_CROPS = ("chips", "strips", "xy_work", "sizes")
 """Arrays of weak candidates: patches serve the linking of detections alone."""
 
 
@@ -297,7 +299,8 @@ def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice], names: Iter
     crops: dict[str, list[NDArray[Any]]] = {name: [_NO_CROPS[name]] for name in names}
     for one, some in zip(detections, rows, strict=True):
         for name in crops:
-            crops[name].append((one.xy if name == "xy_work" else getattr(one, name))[some])
+            values = one.xy if name == "xy_work" else getattr(one, name)
+            crops[name].append(values[some].astype(_NO_CROPS[name].dtype, copy=False))
     return Cars(column, crops)
 
 

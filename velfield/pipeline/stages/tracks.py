@@ -9,7 +9,7 @@ from threading import Lock
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import IntArray, Mask
+from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import assumed_gsd_m
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.detection.registry import load_detector
@@ -44,7 +44,6 @@ from velfield.tracking.strips import (
     StripSums,
     along_headings,
     certain_length,
-    images_of_tracks,
     mean_grey,
     measure_tracks,
 )
@@ -56,6 +55,7 @@ _CONFIDENCE = 0.95
 """Confidence of a tracklet that only its track confirms: at least this fraction was right in simulated flights."""
 _HIDDEN_S = 1.5
 """A track that ends so shortly before the last frame, or begins so shortly after the first, did not vanish."""
+_NO_SIZES = np.empty((0, 4)), np.empty(0, np.int64)
 _AT_ONCE = 4
 """Threads, each of which holds what is stored of one unit's detections."""
 
@@ -90,7 +90,7 @@ def chain_tracks(plan: Plan) -> StageResult:
         del seen
     apart = positions[positions["track_id"].isin(doubtful)].reset_index(drop=True)
     positions = _without(positions, doubtful)
-    images = images_of_tracks(strips, found.tracks)
+    dimensions = measure_tracks(strips, found.tracks)
     del strips
     triples = find_triples(positions, flight, plan.config.tracking.max_interval_s)
     track = found.tracks[chain]
@@ -106,7 +106,7 @@ def chain_tracks(plan: Plan) -> StageResult:
         for stale in set(layout.unit_files(folder)) - set(written):
             stale.unlink()  # of an earlier plan with more units
     for path, table, columns in (
-        (layout.dimensions, measure_tracks(images), DIMENSION_COLUMNS),
+        (layout.dimensions, dimensions, DIMENSION_COLUMNS),
         (layout.joins, found.joins, JOIN_COLUMNS),
     ):
         write_table(path, _without(table, np.concatenate([doubles, doubtful])), columns)
@@ -322,16 +322,16 @@ def _gap_limits(plan: Plan) -> GapLimits:
 
 
 def sum_strips(plan: Plan, tracklets: pd.DataFrame) -> StripSums:
-    """Read the strips that stand for each chain, unit by unit, as all together take much space."""
+    """Read the strips and the sizes that stand for each chain, unit by unit, as all strips together take much space."""
     ids, chosen = sample_tracks(tracklets)
     numbers, chains = chosen["detection_id"].to_numpy(), chosen["track"].to_numpy()
     heading, whys = chosen["heading_rad"].to_numpy(), [chosen[name].to_numpy() for name in ("spread", "start", "end")]
     total, count = np.zeros((3, len(ids), *STRIP_SHAPE), np.float32), np.zeros((3, len(ids)), np.int64)
     lock = Lock()
 
-    def add(path: Path) -> float:
+    def add(path: Path) -> tuple[FloatArray, IntArray]:
         table = read_tables([path], DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
-        patches = read_arrays(path.with_suffix(".patches.npz"), only=["strips", "working_scale"])
+        patches = read_arrays(path.with_suffix(".patches.npz"), only=["strips", "sizes", "working_scale"])
         here = np.flatnonzero(among(numbers, table["detection_id"].to_numpy()))
         at, chain = np.searchsorted(table["detection_id"].to_numpy(), numbers[here]), chains[here]
         strips = along_headings(patches["strips"][at], table["orientation_rad"].to_numpy(np.float64)[at], heading[here])
@@ -340,10 +340,14 @@ def sum_strips(plan: Plan, tracklets: pd.DataFrame) -> StripSums:
                 rows = why[here]
                 np.add.at(total[which], chain[rows], strips[rows])
                 np.add.at(count[which], chain[rows], 1)
-        return float(patches["working_scale"])
+        sizes, spread = patches["sizes"][at].astype(np.float64), whys[0][here]
+        sizes[:, :2] /= float(patches["working_scale"])
+        spread &= np.isfinite(sizes).all(axis=1)
+        return sizes[spread], chain[spread]
 
-    scales = parallel_map(add, _detection_files(plan), at_most=_AT_ONCE)
-    return StripSums(ids, total, count, scales[-1] if scales else 1.0)
+    found = parallel_map(add, _detection_files(plan), at_most=_AT_ONCE)
+    sizes, chain = (np.concatenate([none, *(part[k] for part in found)]) for k, none in enumerate(_NO_SIZES))
+    return StripSums(ids, total, count, sizes, chain)
 
 
 def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSums) -> EndContext:
