@@ -5,6 +5,8 @@ import pytest
 
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.dataset import PatchDataset
+from velfield.detection.cnn.inference import Predictor
+from velfield.detection.cnn.model import detect_cars
 from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.trainer import LossNormaliser, Trainer, focal_loss_and_gradient
 from velfield.detection.registry import shipped_detector
@@ -56,3 +58,20 @@ def test_unlabelled_tiles_are_labelled_only_where_both_networks_are_certain() ->
     assert 0.2 < labelled.valid.mean() <= 1
     rows, columns = (np.rint(labelled.cars[:, k]).astype(int) for k in (1, 0))
     assert labelled.valid[rows, columns].all()
+
+
+def test_sizes_are_fitted_to_the_network_which_stays_as_it_is() -> None:
+    from tools.sizes import fit_sizes
+
+    bare = Trainer.from_network(shipped()).network()
+    assert not bare.measures
+    scene = simulated_image(9504)
+    fitted = fit_sizes(bare, [[scene]], [1.0], seed=0, steps=30)
+    for name, weights in bare.weights.items():
+        np.testing.assert_array_equal(fitted.weights[name], weights)
+    found = detect_cars(Predictor(fitted), scene.image, None)
+    distance = np.hypot(*(found[:, None, :2] - scene.cars[None, :, :2]).transpose(2, 0, 1))
+    near = distance.min(axis=1) < 3
+    lengths = scene.cars[distance.argmin(axis=1)[near], 3]
+    assert near.sum() > 20
+    assert np.median(np.abs(np.log(found[near, 5] / lengths))) < 0.12
