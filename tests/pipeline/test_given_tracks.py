@@ -171,7 +171,7 @@ def test_each_format_gives_the_same_answers(form: str, run: Run, tmp_path: Path)
     other = process(path, tmp_path / "run", **({"gsd_m": GSD_M} | said))
     expected = answers(run.analysis.traffic)
     assert expected[0] > 3
-    assert answers(other.analysis.traffic) == pytest.approx(expected, rel=0.02, abs=0.6)
+    assert answers(other.analysis.traffic) == pytest.approx(expected, rel=0.02, abs=1.0)  # m: an end of a lane
     known, all_known = (np.isfinite(r.field.modal_velocity()).all(axis=2).sum() for r in (other, run))
     # pixels end at their image's border, metres have a margin in which lanes are as wide as elsewhere
     assert known == pytest.approx(all_known, rel=0.06 if form == "pixels" else 0.02)
