@@ -226,7 +226,7 @@ STAGES: tuple[Stage, ...] = (
     # The shipped detector, one that is fine-tuned on labelled frames, or a given one.
     Stage(
         name="detector",
-        version=28,
+        version=29,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
@@ -243,7 +243,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=23,
+        version=24,
         label="detections",
         lines=(
             Line(
@@ -277,7 +277,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=17,
+        version=18,
         label="tracks",
         lines=(
             Line(
@@ -298,7 +298,7 @@ STAGES: tuple[Stage, ...] = (
     # Scale, north and place again, with the lengths of the vehicles.
     Stage(
         name="scale",
-        version=2,
+        version=3,
         label="scale",
         lines=(
             Line(
