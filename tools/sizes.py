@@ -7,11 +7,9 @@ gives too. It needs PyTorch (`pip install torch`), and takes three minutes of on
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
-from onnx import TensorProto, helper
 from torch import nn
 
 from schemas.arrays import Float32Array, FloatArray
@@ -20,6 +18,7 @@ from velfield.detection.cnn.graph import network_graph
 from velfield.detection.cnn.inference import Predictor
 from velfield.detection.cnn.model import detect_cars, find_peaks
 from velfield.detection.cnn.network import SIZE_LAYER, SIZE_STRIDE, STRIDE, USUAL_SIZE_PX, Network
+from velfield.detection.cnn.sizes import LOG_SCALE_RANGE, to_bytes
 from velfield.detection.cnn.trainer import lr_schedule
 from velfield.detection.nms import nms_oriented
 from velfield.detection.runtime import open_session, serialize
@@ -27,8 +26,6 @@ from velfield.detection.samples import LabelledImage
 
 STEPS = 5000
 """Batches of patches whose vehicles are read."""
-_LOG_SCALE_RANGE = 0.5
-"""Of the patches: less leaves lengths near to the usual one where the scale is wrong by a fifth."""
 _FIT_STEPS, _FIT_BATCH, _FIT_RATE = 6000, 1024, 3e-3
 _MIN_PROBABILITY, _NEAR_PX, _NEAR_LENGTHS = 0.3, 4.0, 0.15
 """Of a peak that shows a labelled vehicle; its distance from the centre, or that in lengths where it is more."""
@@ -47,7 +44,7 @@ def fit_sizes(
     steps: int = STEPS,
 ) -> Network:
     """The network with a layer of sizes fitted to it; ``groups`` and ``weights`` as for `PatchDataset`."""
-    dataset = PatchDataset(groups, weights, seed, hard=True, log_scale_range=_LOG_SCALE_RANGE)
+    dataset = PatchDataset(groups, weights, seed, hard=True, log_scale_range=LOG_SCALE_RANGE)
     features, logarithms = _read_vehicles(network, dataset, steps)
     weight, bias = _fit(features, logarithms, seed)
     return Network(
@@ -58,15 +55,12 @@ def fit_sizes(
 
 def _read_vehicles(network: Network, dataset: PatchDataset, steps: int) -> tuple[Float32Array, Float32Array]:
     """Features (n, channels) of the vehicles that the network sees, and logarithms (n, 2) of length and width."""
-    graph = network_graph(_without_sizes(network))
-    source = next(node.input[0] for node in graph.node if node.name == SIZE_LAYER.name)
-    graph.output.extend([helper.make_tensor_value_info(source, TensorProto.FLOAT, None)])
-    session = open_session(serialize(graph), "cpu")
+    session = open_session(serialize(network_graph(network, with_features=True)), "cpu")
     found = [np.empty((0, SIZE_LAYER.channels_in + 2), np.float32)]
     for step in range(steps):
         patches = dataset.make_patches(step)
-        images = np.stack([np.rint(np.clip(patch.image, 0, 1) * 255).astype(np.uint8) for patch in patches])
-        outputs = session.run(["probability", "orientation", source], {"image": images[:, None]})
+        images = to_bytes(np.stack([patch.image for patch in patches]))
+        outputs = session.run(["probability", "orientation", "features"], {"image": images[:, None]})
         for patch, probability, orientation, features in zip(patches, *outputs, strict=True):
             peaks = find_peaks(probability[0], orientation, None, stride=STRIDE, min_probability=_MIN_PROBABILITY)
             rows, at = _seen_vehicles(patch, peaks[:, :2])
@@ -74,16 +68,6 @@ def _read_vehicles(network: Network, dataset: PatchDataset, steps: int) -> tuple
             found.append(np.column_stack([features[:, y, x].T, np.log(patch.vehicles[rows, 3:5] / USUAL_SIZE_PX)]))
     table = np.concatenate(found).astype(np.float32)
     return table[:, : SIZE_LAYER.channels_in], table[:, SIZE_LAYER.channels_in :]
-
-
-def _without_sizes(network: Network) -> Network:
-    """The network with zeros for the layer of sizes, which it may not have."""
-    weights = {**network.weights, SIZE_LAYER.name: np.zeros(SIZE_LAYER.shape, np.float32)}
-    return replace(
-        network,
-        weights=weights,
-        biases={**network.biases, SIZE_LAYER.name: np.zeros(SIZE_LAYER.channels_out, np.float32)},
-    )
 
 
 def _seen_vehicles(patch: Patch, peaks: FloatArray) -> tuple[np.ndarray, np.ndarray]:

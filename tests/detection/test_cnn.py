@@ -56,6 +56,20 @@ def test_fine_tuning_is_deterministic_and_keeps_the_attribution() -> None:
     assert one.onnx != record.onnx
 
 
+def test_a_fine_tuned_network_measures_as_the_one_that_it_began_with() -> None:
+    labelled, other = city(9504), simulated_image(9506, large_share=0.3).image
+    record = fine_tune([labelled], shipped(), shipped_detector().record, CnnConfig(fine_tune_steps=40))
+    before, after = (detect_cars(Predictor(one), other, None) for one in (shipped(), network_from_record(record.onnx)))
+    distance = np.hypot(*(before[:, None, :2] - after[None, :, :2]).transpose(2, 0, 1))
+    same = distance.min(axis=1) < 3
+    change = np.log(after[distance.argmin(axis=1)[same], 5:7] / before[same, 5:7])
+    assert same.sum() > 40
+    assert np.abs(np.median(change, axis=0)).max() < 0.06
+    long = before[same, 5] > 24
+    assert long.sum() > 3
+    assert np.abs(np.median(change[long, 0])) < 0.12
+
+
 def test_labels_that_do_not_lie_on_cars_are_refused() -> None:
     """Those of another picture would train a detector that finds nothing."""
     labelled, other = city(9504), city(9505)

@@ -17,6 +17,7 @@ from velfield.detection.cnn.graph import network_to_record
 from velfield.detection.cnn.inference import Predictor, predict_heatmap
 from velfield.detection.cnn.model import detect_cars
 from velfield.detection.cnn.network import Network
+from velfield.detection.cnn.sizes import LOG_SCALE_RANGE, copy_sizes
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.evaluation import (
     HELD_OUT_DESCRIPTION,
@@ -71,6 +72,9 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
         steps -= steps // 2
     dataset = PatchDataset([masked], [1.0], config.seed)
     network = train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
+    if pretrained.measures:
+        of_all_sizes = PatchDataset([masked], [1.0], config.seed, log_scale_range=LOG_SCALE_RANGE)
+        network = copy_sizes(network, pretrained, of_all_sizes)
     threshold, curve = select_threshold(evidence, record.threshold)
     if curve is not None:
         weight = count / (count + _PRIOR_CARS)

@@ -41,8 +41,9 @@ def network_to_onnx(network: Network) -> bytes:
     return serialize(network_graph(network, half=True))
 
 
-def network_graph(network: Network, *, half: bool = False) -> onnx.GraphProto:
-    """The graph of `network_to_onnx`; weights at single precision unless at ``half``."""
+def network_graph(network: Network, *, half: bool = False, with_features: bool = False) -> onnx.GraphProto:
+    """The graph of `network_to_onnx`; weights at single precision unless at ``half``. ``with_features``: one more
+    output, ``features`` (n, channels, h / 4, w / 4), from which `SIZE_LAYER` reads the sizes."""
     graph = _GraphBuilder(network, half=half)
     grey = graph.node("Cast", ["image"], to=TensorProto.FLOAT)
     out = graph.layers(TOPOLOGY, graph.node("Mul", [grey, graph.constant("scale", np.array(1 / 255, np.float32))]))
@@ -60,6 +61,13 @@ def network_graph(network: Network, *, half: bool = False) -> onnx.GraphProto:
     if network.measures:
         graph.conv(SIZE_LAYER, graph.features)
         sizes[SIZE_LAYER.name] = ["n", SIZE_LAYER.channels_out, "h / 4", "w / 4"]
+    if with_features:
+        sizes[graph.node("Identity", [graph.features], output="features")] = [
+            "n",
+            SIZE_LAYER.channels_in,
+            "h / 4",
+            "w / 4",
+        ]
     image, *outputs = (
         helper.make_tensor_value_info(name, TensorProto.UINT8 if name == "image" else TensorProto.FLOAT, size)
         for name, size in sizes.items()
@@ -148,7 +156,7 @@ def _blocks(layers: Topology) -> dict[str, int]:
 def network_from_onnx(data: bytes) -> Network:
     """Read the weights of an ONNX model that `network_to_onnx` wrote.
 
-    One that was fine-tuned has no layer of sizes.
+    One that version 1.1 or an earlier one wrote has no layer of sizes.
 
     Raises
     ------
