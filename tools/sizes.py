@@ -16,8 +16,8 @@ from schemas.arrays import Float32Array, FloatArray
 from velfield.detection.cnn.dataset import Patch, PatchDataset
 from velfield.detection.cnn.graph import network_graph
 from velfield.detection.cnn.inference import Predictor
-from velfield.detection.cnn.model import detect_cars, find_peaks
-from velfield.detection.cnn.network import SIZE_LAYER, SIZE_STRIDE, STRIDE, USUAL_SIZE_PX, Network
+from velfield.detection.cnn.model import detect_cars, find_peaks, read_at
+from velfield.detection.cnn.network import SIZE_LAYER, STRIDE, USUAL_SIZE_PX, Network
 from velfield.detection.cnn.sizes import LOG_SCALE_RANGE, to_bytes
 from velfield.detection.cnn.trainer import lr_schedule
 from velfield.detection.nms import nms_oriented
@@ -64,8 +64,8 @@ def _read_vehicles(network: Network, dataset: PatchDataset, steps: int) -> tuple
         for patch, probability, orientation, features in zip(patches, *outputs, strict=True):
             peaks = find_peaks(probability[0], orientation, None, stride=STRIDE, min_probability=_MIN_PROBABILITY)
             rows, at = _seen_vehicles(patch, peaks[:, :2])
-            x, y = np.floor((peaks[at, :2].T + 0.5) / SIZE_STRIDE).astype(np.int64)
-            found.append(np.column_stack([features[:, y, x].T, np.log(patch.vehicles[rows, 3:5] / USUAL_SIZE_PX)]))
+            seen = read_at(features, peaks[at, :2])
+            found.append(np.column_stack([seen, np.log(patch.vehicles[rows, 3:5] / USUAL_SIZE_PX)]))
     table = np.concatenate(found).astype(np.float32)
     return table[:, : SIZE_LAYER.channels_in], table[:, SIZE_LAYER.channels_in :]
 

@@ -230,7 +230,7 @@ STAGES: tuple[Stage, ...] = (
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
-            Line("the shipped detector, as it is", lambda counts: counts.get("labels") == 0),
+            Line("used as it is", lambda counts: counts.get("labels") == 0),
             Line("trained on {labels:.0f} labelled cars"),
         ),
         unit=f"{_STAGES}.detector:make_detector",

@@ -60,10 +60,15 @@ def detect_cars(
 def read_sizes(sizes: Float32Array, xy: FloatArray) -> FloatArray:
     """Sizes (n, 4) at positions (n, 2), working px: length and width, px, and the standard deviations of their
     logarithms; ``sizes`` (4, h, w) as the network gives them."""
-    column, row = (np.floor((xy[:, k] + 0.5) / SIZE_STRIDE).astype(np.int64) for k in (0, 1))
-    found = sizes[:, np.clip(row, 0, sizes.shape[1] - 1), np.clip(column, 0, sizes.shape[2] - 1)].astype(np.float64).T
+    found = read_at(sizes, xy).astype(np.float64)
     length_and_width = np.exp(np.clip(found[:, :2], *_LOG_SIZES)) * USUAL_SIZE_PX
     return np.column_stack([length_and_width, np.exp(np.clip(found[:, 2:], *_LOG_SD))])
+
+
+def read_at(maps: Float32Array, xy: FloatArray) -> Float32Array:
+    """Values (n, channels) at positions (n, 2), working px, of maps (channels, h, w) of a pixel each `SIZE_STRIDE`."""
+    column, row = (np.floor((xy[:, k] + 0.5) / SIZE_STRIDE).astype(np.int64) for k in (0, 1))
+    return maps[:, np.clip(row, 0, maps.shape[1] - 1), np.clip(column, 0, maps.shape[2] - 1)].T
 
 
 _VIEW_PX, _VIEWS, VIEW_REACH_PX = 80, 64, 48

@@ -10,8 +10,8 @@ from schemas.arrays import Float32Array
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.graph import network_graph
 from velfield.detection.cnn.inference import Predictor
-from velfield.detection.cnn.model import find_peaks
-from velfield.detection.cnn.network import SIZE_LAYER, SIZE_STRIDE, STRIDE, Network
+from velfield.detection.cnn.model import find_peaks, read_at
+from velfield.detection.cnn.network import SIZE_LAYER, STRIDE, Network
 from velfield.detection.runtime import open_session, serialize
 
 LOG_SCALE_RANGE = 0.5
@@ -36,8 +36,7 @@ def copy_sizes(network: Network, former: Network, patches: PatchDataset) -> Netw
         outputs = session.run(["probability", "orientation", "features"], {"image": images[:, None]})
         for probability, orientation, features, wanted in zip(*outputs, predict(images)[2], strict=True):
             peaks = find_peaks(probability[0], orientation, None, stride=STRIDE, min_probability=_MIN_PROBABILITY)
-            x, y = np.clip((peaks[:, :2].T + 0.5) / SIZE_STRIDE, 0, features.shape[2] - 1).astype(np.int64)
-            rows.append(np.concatenate([features[:, y, x], wanted[:, y, x]]).T)
+            rows.append(np.hstack([read_at(part, peaks[:, :2]) for part in (features, wanted)]))
     seen, wanted = np.split(np.concatenate(rows).astype(np.float64), [SIZE_LAYER.channels_in], axis=1)
     weights, bias = former.weights[SIZE_LAYER.name][0].astype(np.float64), former.biases[SIZE_LAYER.name]
     if len(seen):
