@@ -67,14 +67,15 @@ def run_flow(
 def process_flight(job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
-    with locked(layout, stop_lost), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
+    with locked(layout, stop_lost), _leave_no_trace(layout):
         by.mark_killed(absolute(job.root))
         sweep_partial(layout.root)
         remove_tree(layout.preview)
         plan = make_plan(job)
         validate_inputs(plan)
         check_space(plan)
-        with disk_full_as_input_error(plan):
+        # Not before: what it loads would take the interpreter from planning, which the first frame waits for.
+        with open_runner(runner, console.warn) as where, disk_full_as_input_error(plan):
             return _run_stages(plan, where, parallel_units(runner), console, by)
 
 

@@ -15,7 +15,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -130,7 +130,7 @@ class ThreadsRunner(Runner):
         # One pool for all units at once: each on threads of its own, two cores ran four blocks at a time, out of each
         # other's cache.
         self._pool = ThreadPoolExecutor(threads, "dask")
-        self._pool.submit(_load)  # while the run is planned
+        threading.Thread(target=_load, name="load", daemon=True).start()
         self.description = f"{threads} threads of this process"
 
     def compute(self, graph: Any) -> Any:
@@ -240,8 +240,10 @@ class ClientRunner(Runner):
 
 
 def _load() -> None:
-    load_stages()
-    load_kernels()
+    """Import what the later stages need while the first frames are decoded, which is done outside the interpreter."""
+    with suppress(Exception):  # what fails here fails again, and is told, where it is needed
+        load_stages()
+        load_kernels()
 
 
 def _count_tasks(dask_scheduler: Any) -> int:
@@ -282,7 +284,7 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
 
 
 def _load_stages(client: Any) -> None:
-    """Let each worker import what it will need, while the run is planned; without waiting for it.
+    """Let each worker import what it will need; without waiting for it.
 
     Its one thread has just the time for it: kernels are loaded when they are called first.
     """
