@@ -27,7 +27,7 @@ from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
 from velfield.pipeline.summary import summarise_run
 from velfield.run.commits import sweep_partial
 from velfield.run.flight_record import check_format
-from velfield.run.layout import RunLayout, remove_tree, to_path
+from velfield.run.layout import RunLayout, is_remote, remove_tree, to_path
 from velfield.run.lock import locked
 from velfield.run.results import (
     link_shared_outputs,
@@ -96,6 +96,8 @@ def reprocess(
             )
         except InputError:
             remove_tree(to_path(job.root))
+            if not is_remote(run.layout.results) and not any(run.layout.results.iterdir()):
+                run.layout.results.rmdir()
             raise
         return publish_result(run, name, Path(base)), summary
 

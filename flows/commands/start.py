@@ -6,8 +6,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".ts", ".m4v")
-_IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 _MAX_ENTRIES, _SHOWN = 2000, 3
 
 
@@ -27,10 +25,12 @@ def start(folder: Path) -> int:
 
 def next_steps(folder: Path) -> Iterator[str]:
     """Lines of what to do next."""
+    from velfield.sources.frames import VIDEO_SUFFIXES
+
     yield "velfield: aerial video of a city in, a probability distribution over vehicle velocity at every pixel out.\n"
     entries = sorted(folder.iterdir())[:_MAX_ENTRIES]
     runs = [entry for entry in entries if (entry / "flight.json").is_file()]
-    videos = [entry for entry in entries if entry.suffix.lower() in VIDEOS and entry.is_file()]
+    videos = [entry for entry in entries if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
     images = [entry for entry in entries if entry.is_dir() and entry not in runs and _has_images(entry)]
     yield from _of_runs(runs)
     yield from _of_videos(videos, {run.name for run in runs}, entries)
@@ -38,7 +38,7 @@ def next_steps(folder: Path) -> Iterator[str]:
         yield f"A folder of images, {entry.name}. They need times:"
         yield f"  velfield run {shlex.quote(entry.name)} --timestamps times.csv --out RUN   # or --fps 5\n"
     if not (runs or videos or images):
-        yield "No video and no run in this folder. See it work, on a simulated flight (about three minutes):"
+        yield "No video and no run in this folder. See it work, on a simulated flight (about a minute):"
         yield "  velfield demo\n"
         yield "Your own video, from a camera that looks down and stays over one place:"
         yield "  velfield run VIDEO --out RUN\n"
@@ -74,8 +74,10 @@ def _of_videos(videos: list[Path], runs: set[str], entries: list[Path]) -> Itera
 
 
 def _has_images(folder: Path) -> bool:
+    from velfield.sources.frames import IMAGE_SUFFIXES
+
     try:
         names = (entry.suffix.lower() for _, entry in zip(range(_MAX_ENTRIES), folder.iterdir(), strict=False))
-        return sum(name in _IMAGES for name in names) > 2
+        return sum(name in IMAGE_SUFFIXES for name in names) > 2
     except OSError:
         return False

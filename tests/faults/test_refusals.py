@@ -52,7 +52,11 @@ def command(
         (("fly",), 2, 'Unknown command "fly"'),
         (("run", "a", "--out", "b", "--workers", "many"), 2, "--workers"),
         (("run", "a", "--out", "b", "--workers", "0"), 1, "--workers 0: must be a positive integer"),
-        (("run", "a", "--out", "b", "--gsd-m", "23"), 1, "gsd_m = 23"),
+        (
+            ("run", "a", "--out", "b", "--gsd-m", "23"),
+            1,
+            "gsd_m = 23.0: input should be less than or equal to 5 (ground sample distance of the base image, m a",
+        ),
         (("verify", "/dev/null"), 1, "/dev/null"),
         (("view", "s3://runs/flight"), 1, "s3://runs/flight: a run on S3 cannot be shown"),
         (("run", "http://host/video.mp4", "--out", "out"), 1, "http"),

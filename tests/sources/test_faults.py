@@ -351,6 +351,11 @@ def test_nothing_there_an_empty_folder_and_a_folder_of_videos_stop(tmp_path, fra
     assert_stops(tmp_path / "none", "found no video or image folder")
     (tmp_path / "empty").mkdir()
     assert_stops(tmp_path / "empty", "found no images in the folder")
+    write_video(tmp_path / "empty" / "b.mp4", frames[:5])
+    assert_stops(tmp_path / "empty", "found no images in the folder.*; of the video in it: velfield run empty/b.mp4")
+    write_images(tmp_path / "empty", frames[:1])
+    assert_stops(tmp_path / "empty", "without times.*; of the video in it: velfield run empty/b.mp4", FramesConfig())
+    assert_stops(next((tmp_path / "empty").glob("*.png")), "found one image.*; --base takes a base image")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert_stops(tmp_path / "loop", "found no video or image folder")
 

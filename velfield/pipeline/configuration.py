@@ -178,7 +178,7 @@ def _validate(tree: Tree, what: str) -> FlightConfig:
             found, expected = first["ctx"]["tag"], first["ctx"]["expected_tags"]
             raise InputError(f"{what}: {where}.method = {found!r}: expected one of {expected}") from None
         problem = "expected keys with values" if first["type"] == "union_tag_not_found" else first["msg"].lower()
-        raise InputError(f"{what}: {where} = {first['input']!r}: {problem}") from None
+        raise InputError(f"{what}: {where} = {first['input']!r}: {problem}{_what_is(where)}") from None
 
 
 def _parts(location: Sequence[str | int]) -> tuple[str, str | None, tuple[str, ...]]:
@@ -205,6 +205,12 @@ def _unread(section: str, method: str, key: str) -> str:
         f"{section}.{key} is read by {' and '.join(readers)}, not by {method}; {instead}choose {section}.method="
         f"{readers[0]} or leave it out"
     )
+
+
+def _what_is(key: str) -> str:
+    """What a key outside the sections is, with its unit."""
+    info = FlightConfig.model_fields.get(key)
+    return "" if info is None or info.description is None else f" ({info.description.partition(';')[0].lower()})"
 
 
 def _did_you_mean(key: str) -> str:

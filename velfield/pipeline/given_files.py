@@ -1,7 +1,6 @@
 """The files that were given beside the frames: whether they can be read, and whether a base image shows the area."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from schemas.arrays import GreyImage
@@ -41,7 +40,7 @@ def _read_detector(path: Path, plan: Plan) -> Detector:
 def check_base_area(plan: Plan) -> None:
     """Refuse a base image of another area by one frame of the flight's middle, before the others are decoded.
 
-    The lens is not known yet. So the middle of the frame, where a lens distorts little, is tried as well as all of it,
+    The lens is not known yet. So the middle of the frame, where a lens distorts little, is tried where all of it fails,
     both reduced, and only an image to which neither registers is refused; the base stage decides on the others.
 
     Raises
@@ -55,12 +54,12 @@ def check_base_area(plan: Plan) -> None:
     base = read_base_raster(Path(plan.job.inputs.base or ""), plan.config.frames).grey
     height, width = grey.shape
     middle = grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    with ThreadPoolExecutor(2) as pool:
-        tries = [pool.submit(_register_reduced, plan, image, base) for image in (grey, middle)]
-        found = [one.result() for one in tries]
-    reasons = [one.reason for one in found if isinstance(one, Failure)]
-    if len(reasons) < len(found):
-        return
+    reasons = []
+    for image in (grey, middle):
+        found = _register_reduced(plan, image, base)
+        if not isinstance(found, Failure):
+            return
+        reasons.append(found.reason)
     reason = next((reason for reason in reasons if MIRRORED in reason), reasons[-1])
     raise InputError(f"--base {plan.job.inputs.base}: {reason}")
 

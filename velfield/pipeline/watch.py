@@ -11,10 +11,8 @@ from pathlib import Path
 
 from schemas.job import Inputs
 from velfield.errors import InputError
+from velfield.sources.frames import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from velfield.sources.telemetry.find import TELEMETRY_SUFFIXES
-
-VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".ts", ".m4v", ".mpg", ".webm"})
-IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 
 
 def run_name(drop: Path) -> str:
@@ -25,7 +23,7 @@ def run_name(drop: Path) -> str:
     >>> run_name(Path("incoming/Main St. 4.mp4"))
     'Main-St-4'
     """
-    stem = drop.stem if drop.suffix.lower() in VIDEOS else drop.name
+    stem = drop.stem if drop.suffix.lower() in VIDEO_SUFFIXES else drop.name
     name = re.sub(r"[^A-Za-z0-9_-]+", "-", stem).strip("-")
     if not name:
         raise InputError(f"{drop}: its name has no letter or digit, and the run is named after it; rename it")
@@ -40,7 +38,7 @@ def is_flight(drop: Path) -> bool:
     >>> is_flight(Path("incoming/DJI_0001.MP4")), is_flight(Path("incoming/DJI_0001.SRT"))
     (True, False)
     """
-    return drop.is_dir() or drop.suffix.lower() in VIDEOS
+    return drop.is_dir() or drop.suffix.lower() in VIDEO_SUFFIXES
 
 
 def is_telemetry(drop: Path) -> bool:
@@ -70,7 +68,7 @@ def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
     if source == drop:
         return Inputs(source=str(drop)), None
     beside = {
-        "base": _first(path for path in sorted(drop.glob("base.*")) if path.suffix.lower() in IMAGES),
+        "base": _first(path for path in sorted(drop.glob("base.*")) if path.suffix.lower() in IMAGE_SUFFIXES),
         "labels": _first(path for path in (drop / "labels.csv", drop / "labels") if path.exists()),
         "timestamps": _first(path for path in (drop / "timestamps.csv",) if path.exists()),
         "detector": _first(path for path in (drop / "detector.json",) if path.exists()),
@@ -83,7 +81,7 @@ def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
 def _source_in(drop: Path) -> Path:
     if (drop / "frames").is_dir():
         return drop / "frames"
-    videos = [path for path in sorted(drop.iterdir()) if path.suffix.lower() in VIDEOS]
+    videos = [path for path in sorted(drop.iterdir()) if path.suffix.lower() in VIDEO_SUFFIXES]
     if len(videos) > 1:
         raise InputError(f"{drop}: found {len(videos)} videos; drop one flight at a time")
     return videos[0] if videos else drop
@@ -125,7 +123,7 @@ def find_image(folder: Path, name: str) -> Path:
 
 def newest_image(folder: Path) -> Path | None:
     """The image that arrived last; none where there is none."""
-    found = [path for path in folder.glob("*") if path.is_file() and path.suffix.lower() in IMAGES]
+    found = [path for path in folder.glob("*") if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES]
     return max(found, key=lambda path: (path.stat().st_mtime, path.name), default=None)
 
 

@@ -9,13 +9,18 @@ import numpy as np
 from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
-from velfield.sources.frames import FootageLoss, SourceFrame, SourceInfo, unreadable_frame
+from velfield.sources.frames import (
+    IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
+    FootageLoss,
+    SourceFrame,
+    SourceInfo,
+    unreadable_frame,
+)
 from velfield.sources.images import check_size, describe_levels, folder_levels, image_size, read_grey_image
 from velfield.sources.quality import FrameFlag
 from velfield.sources.timestamps import read_timestamps
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Files of a folder that are images."""
 _DIGITS = re.compile(r"(\d+)")
 _FEW = 5
 
@@ -77,9 +82,15 @@ def list_images(path: Path) -> tuple[str, ...]:
     if not names:
         raise InputError(
             f"{path.name}: found no images in the folder, expected {', '.join(IMAGE_SUFFIXES)}; "
-            "give the folder that holds them, or a video"
+            f"give the folder that holds them, or a video{_or_video(path)}"
         )
     return tuple(sorted(names, key=natural_key))
+
+
+def _or_video(path: Path) -> str:
+    """What to add where a folder of images was expected and a video lies in it."""
+    videos = sorted(entry.name for entry in path.iterdir() if entry.suffix.lower() in VIDEO_SUFFIXES)
+    return f"; of the video in it: velfield run {path.name}/{videos[0]}" if videos else ""
 
 
 def iter_folder(path: Path, info: SourceInfo, indices: IntArray) -> Generator[SourceFrame, None, None]:
@@ -111,7 +122,7 @@ def _with_times(
         if frames.fps is None:
             raise InputError(
                 f"{path.name}: found {len(names)} images without times, expected them from a side file or a rate; "
-                "give --timestamps CSV (frame,time_s) or --fps F"
+                f"give --timestamps CSV (frame,time_s) or --fps F{_or_video(path)}"
             )
         return names, np.arange(len(names)) / frames.fps, ()
     side = read_timestamps(timestamps)

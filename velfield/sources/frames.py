@@ -13,6 +13,10 @@ import numpy as np
 from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from velfield.errors import InputError
 
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".ts", ".m4v", ".mpg", ".webm")
+"""Files of a folder that are videos."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""Files of a folder that are images."""
 # Two letters or more before the colon: "C:\flight.mp4" is a path. A Path keeps one slash of "http://".
 _PROTOCOL = re.compile(r"^([A-Za-z][A-Za-z0-9+.\-]+):")
 

@@ -137,7 +137,8 @@ def register_intersensor(
             scores.append(f"{candidate.method}: {fit.reason}")
             continue
         count, verification = int(fit.inliers.sum()), verify(pair, fit, candidate.modality)
-        scores.append(f"{candidate.method}: {count} control points, {verification.text}")
+        needed = f"{config.min_control_points} control points needed"
+        scores.append(f"{candidate.method}: {count} of the {needed}, {verification.text}")
         if count >= config.min_control_points and verification.is_verified:
             if candidate.is_blind and not verification.is_certain:
                 continue  # a town of equal blocks matches another place of its own kind, with up to 0.43 of the patches
@@ -158,13 +159,9 @@ def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
     flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
     if flipped.matrix is not None:
         return f"{MIRRORED} ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
-    needed = (
-        f"{pair.config.min_control_points} control points and {MIN_CONSISTENT_FRACTION:.0%} of verification patches "
-        f"needed, by search {_CERTAIN_FRACTION:.0%}"
-    )
     return (
         "not an image of this flight's area; give one of the area, seen from above, at 0.5 to 2 times the frames' "
-        f"scale. Tried ({needed}): {'; '.join(scores)}"
+        f"scale ({'; '.join(scores)})"
     )
 
 
@@ -196,7 +193,7 @@ def _search_candidates(
     """The best of a search over scales and rotations in each modality, each refined by a finer search."""
     found = search_similarity(pair.image, pair.base, pair.lens, scales=grid[0], rotations_rad=grid[1], initial=initial)
     if not found:
-        scores.append(f"{method}: at no rotation and scale does the frame's centre fit into the base image")
+        scores.append(f"{method}: no fit at any rotation and scale")
     for rough in found:
         finer = search_similarity(
             pair.image,

@@ -15,7 +15,7 @@ import numpy as np
 
 from schemas.arrays import IntArray, Mask
 from velfield.errors import InputError
-from velfield.sources.frames import FootageLoss
+from velfield.sources.frames import IMAGE_SUFFIXES, FootageLoss
 from velfield.sources.video.corruption import capture_errors
 
 # Demuxers that read this one file: playlists (HLS, ffconcat, SDP, image patterns) could name other files or hosts.
@@ -33,6 +33,10 @@ def open_video(path: Path) -> Any:
             return av.open(str(path), mode="r", options=_OPTIONS, **_METADATA)
     except (av.error.FFmpegError, OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            raise InputError(
+                f"{path.name}: found one image, expected a video or a folder of images; --base takes a base image"
+            ) from None
         raise InputError(
             f"{path.name}: could not be opened as video ({why}), expected an intact MP4, MOV, AVI, MKV, TS or "
             "similar file; give a video or a folder of images"
