@@ -26,6 +26,7 @@ from velfield.field.modes import (
     occupied_box,
     quantile,
     speed_cells,
+    speed_variance,
     velocity_modes,
 )
 from velfield.field.segments import SEGMENT_DTYPE
@@ -45,7 +46,7 @@ def gaussian_histogram(mean: tuple[float, float], sigma: float, weight: float = 
 def test_the_speed_histogram_conserves_the_weight_and_its_quantiles_are_the_speeds() -> None:
     h = gaussian_histogram((8.0, 6.0), 1.2)
     cells = np.zeros(max_cells(REACH))
-    total = speed_cells(h, REACH, cells)
+    total = speed_cells(h, occupied_box(h), cells)
     assert cells.sum() == pytest.approx(total)
     y, x = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
     speed = np.repeat(np.hypot(x, y).ravel(), h.ravel() // 10)
@@ -74,11 +75,12 @@ def test_the_deconvolution_factor_is_the_ratio_of_standard_deviations(true_sd: f
     y, x = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1]
     h = np.rint(1e5 * np.exp(-0.5 * ((x - 10) / blurred) ** 2) * (y == 0)).astype(np.int32)
     cells = np.zeros(max_cells(REACH))
-    total = speed_cells(h, REACH, cells)
-    assert deconvolution_factor(cells, total, kernel_variance(kernel)) == pytest.approx(
+    total = speed_cells(h, occupied_box(h), cells)
+    variance = speed_variance(cells, total)
+    assert deconvolution_factor(variance, kernel_variance(kernel)) == pytest.approx(
         true_sd / np.hypot(blurred, 12**-0.5), rel=0.03
     )
-    assert deconvolution_factor(cells, total, 1e9) == 0.0
+    assert deconvolution_factor(variance, 1e9) == 0.0
 
 
 def test_the_bandwidth_follows_scotts_rule_down_to_its_minimum() -> None:

@@ -34,10 +34,13 @@ def kernel_variance(sigma: float) -> float:
     return sigma * sigma + 2.0 / 12.0
 
 
+Box = tuple[int, int, int, int]
+"""First row, row after the last, first column and column after the last of some bins."""
+
+
 @kernel
-def occupied_box(h: NDArray[np.int32]) -> tuple[int, int, int, int]:
-    """First row, row after the last, first column and column after the last of the bins that are not zero; zeros where
-    all are.
+def occupied_box(h: NDArray[np.int32]) -> Box:
+    """Where the bins are that are not zero; zeros where all are.
 
     A vehicle fills some ten of the thousand bins, and each statistic would look at all of them.
     """
@@ -64,13 +67,13 @@ def occupied_box(h: NDArray[np.int32]) -> tuple[int, int, int, int]:
 
 
 @kernel
-def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
+def speed_cells(h: NDArray[np.int32], box: Box, cells: FloatArray) -> float:
     """Fill ``cells`` with the histogram of speed, each bin spread uniformly over one bin's width of speed; returns the
-    sum."""
+    sum. ``box``: the histogram's `occupied_box`."""
     cells[:] = 0.0
     total = 0.0
-    half = CELLS_PER_BIN // 2
-    top, bottom, left, right = occupied_box(h)
+    reach, half = (h.shape[0] - 1) // 2, CELLS_PER_BIN // 2
+    top, bottom, left, right = box
     for y in range(top, bottom):
         for x in range(left, right):
             if h[y, x] <= 0:
@@ -104,16 +107,21 @@ def quantile(cells: FloatArray, total: float, probability: float) -> float:
 
 
 @kernel
-def deconvolution_factor(cells: FloatArray, total: float, blur: float) -> float:
-    """Standard deviation of the speed without the kernel's variance ``blur`` over that with it: the factor by which
-    quantiles move towards the median."""
+def speed_variance(cells: FloatArray, total: float) -> float:
+    """Variance of the speed, bins^2, broadened by the kernel and the bins."""
     mean, square = 0.0, 0.0
     for c in range(cells.size):
         if cells[c] > 0.0:
             speed = (c + 0.5) / CELLS_PER_BIN
             mean += cells[c] * speed
             square += cells[c] * speed * speed
-    variance = square / total - (mean / total) ** 2
+    return square / total - (mean / total) ** 2
+
+
+@kernel
+def deconvolution_factor(variance: float, blur: float) -> float:
+    """Standard deviation of the speed without the kernel's variance ``blur`` over that with it: the factor by which
+    quantiles move towards the median."""
     return sqrt(max(variance - blur, 0.0) / variance)
 
 
@@ -146,11 +154,11 @@ def bandwidth_bins(tracks: int) -> float:
 
 
 @kernel
-def _mean_shift(h: NDArray[np.int32], y: float, x: float, window: float) -> tuple[float, float]:
+def _mean_shift(h: NDArray[np.int32], box: Box, y: float, x: float, window: float) -> tuple[float, float]:
     """Mean shift from (y, x), bins, to a maximum of the smoothed histogram."""
     n = h.shape[0]
     reach = 3.0 * window
-    top, bottom, left, right = occupied_box(h)
+    top, bottom, left, right = box
     kernel_x = np.empty(n)
     for _ in range(_ITERATIONS):
         total, sum_y, sum_x = 0.0, 0.0, 0.0
@@ -179,17 +187,17 @@ def _mean_shift(h: NDArray[np.int32], y: float, x: float, window: float) -> tupl
 
 
 @kernel
-def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
+def main_mode(h: NDArray[np.int32], box: Box, window: float) -> tuple[float, float]:
     """(y, x) in bins of the highest mode of a histogram that is not empty. Equal peaks: the first in raster order."""
     best, best_y, best_x = np.int64(-1), 0, 0
-    top, bottom, left, right = occupied_box(h)
+    top, bottom, left, right = box
     for y in range(top, bottom):
         for x in range(left, right):
             if h[y, x] > 0:
                 value = _smooth(h, y, x)
                 if value > best:
                     best, best_y, best_x = value, y, x
-    y_mode, x_mode = _mean_shift(h, float(best_y), float(best_x), window)
+    y_mode, x_mode = _mean_shift(h, box, float(best_y), float(best_x), window)
     return y_mode, x_mode
 
 
@@ -218,11 +226,11 @@ def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64])
     """
     found = np.empty((64, 3), np.float64)
     n_found = 0
-    top, bottom, left, right = occupied_box(h)
+    box = top, bottom, left, right = occupied_box(h)
     for y in range(top, bottom):
         for x in range(left, right):
             if n_found < found.shape[0] and _is_peak(h, y, x):
-                mode_y, mode_x = _mean_shift(h, float(y), float(x), window)
+                mode_y, mode_x = _mean_shift(h, box, float(y), float(x), window)
                 known = False
                 for k in range(n_found):
                     if (found[k, 0] - mode_y) ** 2 + (found[k, 1] - mode_x) ** 2 < _SAME_MODE_BINS**2:
@@ -255,7 +263,8 @@ def _modal_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDA
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
             if count[y, x] > 0:
-                mode_y, mode_x = _main_mode(histogram[y, x], bandwidth_bins(count[y, x]))
+                h = histogram[y, x]
+                mode_y, mode_x = main_mode(h, occupied_box(h), bandwidth_bins(count[y, x]))
                 out[y, x, 0], out[y, x, 1] = mode_x, mode_y
 
 

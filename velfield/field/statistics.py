@@ -20,7 +20,8 @@ The constants were set on simulated traffic and hold on other seeds; `docs/field
 """
 
 from dataclasses import dataclass
-from math import atan2, cos, erf, hypot, log, pi, sqrt
+from math import erf, hypot, log, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +30,16 @@ from schemas.arrays import FloatArray
 from velfield.compiled import kernel
 from velfield.field.accumulate import VARIANCE_UNIT
 from velfield.field.modes import (
-    CELLS_PER_BIN,
+    Box,
+    bandwidth_bins,
     deconvolution_factor,
     kernel_variance,
+    main_mode,
     max_cells,
-    modal_velocity,
     occupied_box,
     quantile,
     speed_cells,
+    speed_variance,
 )
 from velfield.field.segments import VelocityBins
 
@@ -92,24 +95,16 @@ def _half_width(variance: float, typical: float, pseudocount: float, tracks: flo
 
 @kernel
 def _median_speed(
-    h: NDArray[np.int32], tracks: float, measurement_variance: float, blur: float, cells: FloatArray
+    cells: FloatArray, total: float, variance: float, tracks: float, measurement_variance: float, blur: float
 ) -> tuple[float, float]:
-    """90 % interval of the median speed, bins."""
-    total = speed_cells(h, (h.shape[0] - 1) // 2, cells)
+    """90 % interval of the median speed, bins, by the cells of speed, their sum and the variance of the speed."""
     median = quantile(cells, total, 0.5)
-    mean, square = 0.0, 0.0
-    for c in range(cells.size):
-        if cells[c] > 0.0:
-            speed = (c + 0.5) / CELLS_PER_BIN
-            mean += cells[c] * speed
-            square += cells[c] * speed * speed
-    mean /= total
-    variance = max(square / total - mean * mean - blur, 0.0)
     typical = measurement_variance + (TYPICAL_SPEED_SD * median) ** 2 + MIN_SPEED_SD_BINS**2
-    half_width = MEDIAN_SE_RATIO * _half_width(variance, typical, SPEED_PSEUDOCOUNT, tracks, SPEED_CORRELATION)
+    own = max(variance - blur, 0.0)
+    half_width = MEDIAN_SE_RATIO * _half_width(own, typical, SPEED_PSEUDOCOUNT, tracks, SPEED_CORRELATION)
     n_effective = max(tracks / (1.0 + SPEED_CORRELATION * (min(tracks, PLATOON_SIZE) - 1.0)), 1.0)
     rank = 0.5 * _Z / sqrt(n_effective + 2.0)
-    factor = deconvolution_factor(cells, total, blur)
+    factor = deconvolution_factor(variance, blur)
     below = factor * (median - quantile(cells, total, 0.5 - rank))
     above = factor * (quantile(cells, total, 0.5 + rank) - median)
     return max(median - max(half_width, below), 0.0), median + max(half_width, above)
@@ -117,14 +112,20 @@ def _median_speed(
 
 @kernel
 def _modal_direction(
-    h: NDArray[np.int32], mode_x: float, mode_y: float, tracks: float, measurement_variance: float, blur: float
+    h: NDArray[np.int32],
+    box: Box,
+    mode_x: float,
+    mode_y: float,
+    tracks: float,
+    measurement_variance: float,
+    blur: float,
 ) -> float:
     """Half the 90 % interval of the direction of a mode at (mode_x, mode_y) bins from rest, rad."""
     reach = (h.shape[0] - 1) // 2
     speed = hypot(mode_x, mode_y)
     along_x, along_y = mode_x / speed, mode_y / speed
     mode_weight, total, mean, square = 0.0, 0.0, 0.0, 0.0
-    top, bottom, left, right = occupied_box(h)
+    top, bottom, left, right = box
     for y in range(top, bottom):
         for x in range(left, right):
             if h[y, x] > 0:
@@ -144,43 +145,6 @@ def _modal_direction(
     n_effective = max(tracks * mode_weight / total, 1.0)
     half_width = _half_width(variance, typical, DIRECTION_PSEUDOCOUNT, n_effective, DIRECTION_CORRELATION)
     return min(hypot(half_width, _Z * MIN_MODE_SD_BINS) / speed, float(np.pi))
-
-
-@kernel
-def tile_intervals(
-    histogram: NDArray[np.int32],
-    count: NDArray[np.int32],
-    variance_bins2: FloatArray,
-    mode_bins: FloatArray,
-    sigma_bins: float,
-    stationary_bins: float,
-    out: FloatArray,
-) -> None:
-    """Fill ``out`` (ty, tx, 3): half the interval of the modal direction, rad; ends of the median speed's, bins.
-
-    Parameters
-    ----------
-    histogram, count
-        (ty, tx, nvy, nvx) weights and (ty, tx) tracks; nothing is filled where the count is zero.
-    variance_bins2
-        (ty, tx) mean measurement variance of a track's velocity component.
-    mode_bins
-        (ty, tx, 2) modal velocity as (vx, vy), bins from zero. Below ``stationary_bins`` it has no direction.
-    sigma_bins
-        Standard deviation of the histogram's kernel.
-    """
-    cells = np.zeros(max_cells((histogram.shape[2] - 1) // 2))
-    for y in range(count.shape[0]):
-        for x in range(count.shape[1]):
-            n = float(count[y, x])
-            if n == 0.0:
-                continue
-            h, measurement_variance = histogram[y, x], variance_bins2[y, x]
-            out[y, x, 1], out[y, x, 2] = _median_speed(h, n, measurement_variance, kernel_variance(sigma_bins), cells)
-            mode_x, mode_y = mode_bins[y, x, 0], mode_bins[y, x, 1]
-            if hypot(mode_x, mode_y) > stationary_bins:
-                blur = sigma_bins * sigma_bins + 1.0 / 12.0
-                out[y, x, 0] = _modal_direction(h, mode_x, mode_y, n, measurement_variance, blur)
 
 
 PERCENTILES = (15.0, 50.0, 85.0)
@@ -237,15 +201,27 @@ class TileStatistics:
     median_speed_high_px_per_s: FloatArray
 
 
+class _Tile(NamedTuple):
+    """What the kernel finds of a tile, each (ty, tx, n), in bins: modal velocity (x, y); `_moments`; percentiles of
+    speed; standard errors of direction and of median speed, and half the interval of the modal direction; ends of the
+    median speed's interval."""
+
+    modes: FloatArray
+    moments: FloatArray
+    speeds: FloatArray
+    errors: FloatArray
+    median: FloatArray
+
+
 @kernel
-def _moments(
-    h: NDArray[np.int32], reach: int, stationary: float, mode_y: float, mode_x: float, out: FloatArray
-) -> None:
+def _moments(h: NDArray[np.int32], box: Box, stationary: float, mode_y: float, mode_x: float, out: FloatArray) -> None:
     """Fill ``out`` of one pixel, in bins: 0 mode fraction, 1-2 mean (x, y), 3 central bin's fraction, 4 circular
-    variance, 5 entropy, 6 circular dispersion."""
+    variance, 5 entropy, 6 circular dispersion: n times the variance of the mean direction, rad^2."""
+    reach = (h.shape[0] - 1) // 2
     total, mode_weight, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0
     moving, cosine, sine, plogp = 0.0, 0.0, 0.0, 0.0
-    top, bottom, left, right = occupied_box(h)
+    cosine_2, sine_2 = 0.0, 0.0  # of twice the angle
+    top, bottom, left, right = box
     for y in range(top, bottom):
         for x in range(left, right):
             if h[y, x] <= 0:
@@ -260,9 +236,12 @@ def _moments(
             if (x - mode_x) ** 2 + (y - mode_y) ** 2 <= 4.0:
                 mode_weight += weight
             if speed > stationary:
+                ux, uy = vx / speed, vy / speed
                 moving += weight
-                cosine += weight * vx / speed
-                sine += weight * vy / speed
+                cosine += weight * ux
+                sine += weight * uy
+                cosine_2 += weight * (ux * ux - uy * uy)
+                sine_2 += weight * 2.0 * ux * uy
     out[0] = mode_weight / total
     out[1], out[2] = sum_x / total, sum_y / total
     out[3] = h[reach, reach] / total
@@ -270,63 +249,69 @@ def _moments(
     out[4], out[6] = np.nan, np.nan
     if moving > 0.0:
         length = hypot(cosine, sine) / moving
-        out[4] = max(1.0 - length, 0.0)
-        out[6] = _circular_dispersion(h, reach, stationary, atan2(sine, cosine), moving, length)
-
-
-@kernel
-def _circular_dispersion(
-    h: NDArray[np.int32], reach: int, stationary: float, direction: float, moving: float, length: float
-) -> float:
-    """Circular dispersion (1 - mean cos 2(theta - direction)) / (2 length^2): n times the variance of the mean
-    direction, rad^2."""
-    cosine = 0.0
-    top, bottom, left, right = occupied_box(h)
-    for y in range(top, bottom):
-        for x in range(left, right):
-            if h[y, x] > 0:
-                vx, vy = float(x - reach), float(y - reach)
-                if hypot(vx, vy) > stationary:
-                    cosine += h[y, x] * cos(2.0 * (atan2(vy, vx) - direction))
-    if length <= 1e-9:
-        return np.inf
-    return max(1.0 - cosine / moving, 0.0) / (2.0 * length * length)
+        out[4], out[6] = max(1.0 - length, 0.0), np.inf
+        if length > 1e-9:  # (1 - mean cos 2(theta - mean direction)) / (2 length^2)
+            ux, uy = cosine / (moving * length), sine / (moving * length)
+            about = (cosine_2 * (ux * ux - uy * uy) + sine_2 * 2.0 * ux * uy) / moving
+            out[6] = max(1.0 - about, 0.0) / (2.0 * length * length)
 
 
 @kernel
 def _tile(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
-    mode: FloatArray,
+    variance_bins2: FloatArray,
     stationary: float,
     sigma: float,
     percentiles: FloatArray,
-    moments: FloatArray,
-    speeds: FloatArray,
-    errors: FloatArray,
+    out: _Tile,
 ) -> None:
+    """Fill ``out`` where vehicles passed.
+
+    Parameters
+    ----------
+    variance_bins2
+        (ty, tx) mean measurement variance of a track's velocity component.
+    stationary
+        Speed below which there is no direction, bins.
+    sigma
+        Standard deviation of the histogram's kernel, bins.
+    """
     reach = (histogram.shape[2] - 1) // 2
     cells = np.zeros(max_cells(reach))
     blur = kernel_variance(sigma)
     at_rest = erf(0.5 / (sigma * sqrt(2.0))) ** 2
+    # The kernel at zero velocity extends into the bins next to the central one: directions are of the bins beyond.
+    moving = max(stationary, 1.5)
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
-            n = count[y, x]
-            if n == 0:
+            n = float(count[y, x])
+            if n == 0.0:
                 continue
             h = histogram[y, x]
-            _moments(h, reach, stationary, mode[y, x, 1], mode[y, x, 0], moments[y, x])
-            moments[y, x, 3] = min(moments[y, x, 3] / at_rest, 1.0)
-            total = speed_cells(h, reach, cells)
-            factor = deconvolution_factor(cells, total, blur)
+            box = occupied_box(h)
+            mode_y, mode_x = main_mode(h, box, bandwidth_bins(count[y, x]))
+            moments = out.moments[y, x]
+            _moments(h, box, moving, mode_y, mode_x, moments)
+            moments[3] = min(moments[3] / at_rest, 1.0)
+            total = speed_cells(h, box, cells)
+            variance = speed_variance(cells, total)
+            factor = deconvolution_factor(variance, blur)
             median = quantile(cells, total, 0.5)
             for k in range(percentiles.size):
-                speeds[y, x, k] = median + factor * (quantile(cells, total, percentiles[k] / 100.0) - median)
+                out.speeds[y, x, k] = median + factor * (quantile(cells, total, percentiles[k] / 100.0) - median)
             if n >= 2:
-                errors[y, x, 0] = sqrt(moments[y, x, 6] / n)
-                half = 0.5 / sqrt(float(n))
+                out.errors[y, x, 0] = sqrt(moments[6] / n)
+                half = 0.5 / sqrt(n)
                 rank = (quantile(cells, total, 0.5 + half) - quantile(cells, total, 0.5 - half)) / 2.0
-                errors[y, x, 1] = sqrt((factor * rank) ** 2 + sigma * sigma / n)
+                out.errors[y, x, 1] = sqrt((factor * rank) ** 2 + sigma * sigma / n)
+            measured = variance_bins2[y, x]
+            mode_x, mode_y = mode_x - reach, mode_y - reach
+            out.modes[y, x, 0], out.modes[y, x, 1] = mode_x, mode_y
+            out.median[y, x, 0], out.median[y, x, 1] = _median_speed(cells, total, variance, n, measured, blur)
+            if hypot(mode_x, mode_y) > stationary:
+                of_bins = sigma * sigma + 1.0 / 12.0
+                out.errors[y, x, 2] = _modal_direction(h, box, mode_x, mode_y, n, measured, of_bins)
 
 
 def tile_statistics(
@@ -353,35 +338,26 @@ def tile_statistics(
     percentiles
         Percentiles of speed to compute, %.
     """
-    mode_px_per_s = modal_velocity(histogram, count, bins=bins)
-    shape = count.shape
-    moments, errors = np.full((*shape, 7), np.nan), np.full((*shape, 2), np.nan)
-    speeds = np.full((*shape, len(percentiles)), np.nan)
-    # The kernel at zero velocity extends into the bins next to the central one: directions are of the bins beyond.
-    moving_bins = max(stationary_speed_px_per_s / bins.width_px_per_s, 1.5)
-    sigma = bins.kernel_sigma_bins
-    limits = np.asarray(percentiles, np.float64)
-    _tile(histogram, count, bins.to_bins(mode_px_per_s), moving_bins, sigma, limits, moments, speeds, errors)
-    intervals = np.full((*shape, 3), np.nan)
+    values = (2, 7, len(percentiles), 3, 2)
+    found = _Tile(*(np.full((*count.shape, n), np.nan) for n in values))
     variance_bins2 = variance_sum / (np.maximum(count, 1) * float(VARIANCE_UNIT))
-    stationary_bins = stationary_speed_px_per_s / bins.width_px_per_s
-    tile_intervals(
-        histogram, count, variance_bins2, mode_px_per_s / bins.width_px_per_s, sigma, stationary_bins, intervals
-    )
+    stationary = stationary_speed_px_per_s / bins.width_px_per_s
+    limits = np.asarray(percentiles, np.float64)
+    _tile(histogram, count, variance_bins2, stationary, bins.kernel_sigma_bins, limits, found)
     return TileStatistics(
         n=count,
-        modal_velocity_px_per_s=mode_px_per_s,
-        mode_fraction=moments[..., 0],
-        mean_velocity_px_per_s=moments[..., 1:3] * bins.width_px_per_s,
-        speed_percentiles_px_per_s=speeds * bins.width_px_per_s,
-        stationary_fraction=moments[..., 3],
-        circular_variance=moments[..., 4],
-        entropy_nats=moments[..., 5],
-        direction_se_rad=errors[..., 0],
-        speed_se_px_per_s=errors[..., 1] * bins.width_px_per_s,
-        direction_half_width_rad=intervals[..., 0],
-        median_speed_low_px_per_s=intervals[..., 1] * bins.width_px_per_s,
-        median_speed_high_px_per_s=intervals[..., 2] * bins.width_px_per_s,
+        modal_velocity_px_per_s=found.modes * bins.width_px_per_s,
+        mode_fraction=found.moments[..., 0],
+        mean_velocity_px_per_s=found.moments[..., 1:3] * bins.width_px_per_s,
+        speed_percentiles_px_per_s=found.speeds * bins.width_px_per_s,
+        stationary_fraction=found.moments[..., 3],
+        circular_variance=found.moments[..., 4],
+        entropy_nats=found.moments[..., 5],
+        direction_se_rad=found.errors[..., 0],
+        speed_se_px_per_s=found.errors[..., 1] * bins.width_px_per_s,
+        direction_half_width_rad=found.errors[..., 2],
+        median_speed_low_px_per_s=found.median[..., 0] * bins.width_px_per_s,
+        median_speed_high_px_per_s=found.median[..., 1] * bins.width_px_per_s,
     )
 
 
