@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import re
+
 import numpy as np
 import pytest
 
@@ -540,6 +542,8 @@ def test_pairs_that_errors_leave_in_doubt_are_neither_counted_nor_denied(gap_m: 
     (answer,) = (a for a in find_answers(analysis) if a.topic == "conflicts")
     assert answer.state == state
     assert sum(c.likely for c in analysis.conflicts) == (state == "found")
+    # of one event the interval alone: its middle would be quoted as if it were known
+    assert bool(re.match(r"1 seen, \d+ to \d+ an hour: ", answer.text)) == (state == "found")
 
 
 def in_two_clips(

@@ -15,7 +15,7 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 
 State = Literal["found", "none", "too little data"]
-_SHORT_S, _FEW_TRACKS = 60.0, 30
+_SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
 DELAY_OF_PART = " or more"
 """Said after a delay of vehicles that come into view when they wait already."""
@@ -280,11 +280,11 @@ def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
     """A number of events, and how many an hour that is; of none how rare they are at least."""
     if n:
         rate = estimate_event_rate(n, seconds / 3600) if seconds >= _SHORT_S else None
-        often = (
-            f", {rate.value:.0f} an hour ({rate.low:.0f} to {rate.high:.0f})"
-            if rate
-            else ", too short to say how often"
-        )
+        often = ", too short to say how often"
+        if rate and n < _FEW_EVENTS:  # the middle of so wide an interval would be quoted as if it were known
+            often = f", {rate.low:.0f} to {rate.high:.0f} an hour"
+        elif rate:
+            often = f", {rate.value:.0f} an hour ({rate.low:.0f} to {rate.high:.0f})"
         text = f"{n} seen{often}: {detail}" if detail else f"{n} seen{often}"
         return Answer(topic, "", "found", text, rate, "/h" if rate else "")
     if seconds < _SHORT_S:
