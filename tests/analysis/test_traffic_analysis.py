@@ -1,8 +1,7 @@
 """Answers about constructed traffic: a signal of known cycle, turning counts, free flow, a U-turn, a wrong way."""
 
-from dataclasses import replace
-
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
