@@ -47,7 +47,10 @@ class Report(Model):
     stages: tuple[ReportStage, ...] = ()
     residual: ResidualSeries | None = None
     detection: PrecisionRecallCurve | None = None
-    """Of the detector, on held-out labels."""
+    """Of the detector, on labels held out when it was trained."""
+    detection_source: str = ""
+    """Whose precision and recall these are and who measured them on what, for people; empty in the reports of versions
+    before 1.2."""
     gates: dict[str, int] = Field(default_factory=dict)
     """Counts of what tracking tried, rejected and kept, by the names of `velfield.tracking.gates.GateLog`."""
     notes: tuple[str, ...] = ()

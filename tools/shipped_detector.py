@@ -81,7 +81,9 @@ def make_shipped_detector(data: Path, out: Path, steps: int = STEPS) -> list[str
     ]
     if worse:
         return [*lines, f"not written: the new network is worse on {', '.join(worse)}"]
-    curve = precision_recall_curve(merge_scores(list(found.values())), "cars of parts held out of training")
+    curve = precision_recall_curve(
+        merge_scores(list(found.values())), "labelled cars in parts of its data sets that were held out of training"
+    )
     if curve is not None:
         nearest = int(np.abs(np.array(curve.threshold) - threshold).argmin())
         curve = curve.model_copy(update={"operating_point": nearest})

@@ -146,6 +146,7 @@ def made_report() -> tuple[Report, list[ReportFigure]]:
         detection=PrecisionRecallCurve(
             recall=(0.2, 0.9), precision=(1.0, 0.8), threshold=(1.0, 0.5), operating_point=1, description="12 cars"
         ),
+        detection_source="Precision and recall of a <detector>, measured on",
         gates={"links_tried": 1200, "speed": 30, "of_another_time": 7},
         low_coverage_note="Directions hold; speeds are of single vehicles.",
         notes=("lens taken for a pin-hole",),
@@ -163,6 +164,7 @@ def test_page_is_whole_offline_and_scriptless() -> None:
     reader = Reader()
     reader.feed(page)
     assert not reader.open
+    assert "Precision and recall of a &lt;detector&gt;, measured on 12 cars." in page
     assert not [tag for tag, _ in reader.found if tag in {"script", "iframe", "object", "form"}]
     for _, attributes in reader.found:
         assert not [name for name in attributes if name == "style" or name.startswith("on")]

@@ -294,6 +294,10 @@ def test_the_summary_is_the_report(page: Page, address: str) -> None:
     text = page.value("document.getElementById('summary-panel').innerText")
     for words in ("Direction of travel", "Registration", "Candidates", "Inputs"):
         assert words in text
+    trained = "Precision and recall of the detector that this run trained on labelled frames of the flight. This run"
+    assert re.search(
+        trained + r" measured them on \d+ labelled cars in stripes of the images, detected after half", text
+    )
     page.wait("[...document.querySelectorAll('figure img')][0].naturalWidth > 300")
 
 

@@ -16,7 +16,7 @@ MATCH_PX = 8.0
 MIN_CURVE_SCORE = -0.25
 """Detections with a lower score are false at any precision that is of use."""
 HELD_OUT_DESCRIPTION = (
-    "cars in held-out stripes of the images, detected after half of the training, on the other stripes"
+    "labelled cars in stripes of the images, detected after half of the training, which left these stripes out"
 )
 _CURVE_POINTS = 400
 _RECALL_FRACTION = 0.95

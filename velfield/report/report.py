@@ -158,10 +158,9 @@ def _detection(report: Report) -> str:
     curve = report.detection
     if curve is None or not curve.recall:
         return ""
-    description = f"<p>Measured on {escape(curve.description)}.</p>" if curve.description else ""
-    return _section(
-        "Detection", description + _plot(precision_recall_plot(curve), "Precision of the detector against its recall")
-    )
+    text = f"{report.detection_source or 'Precision and recall of the detector, measured on'} {curve.description}."
+    plot = _plot(precision_recall_plot(curve), "Precision of the detector against its recall")
+    return _section("Detection", f"<p>{escape(text)}</p>{plot}")
 
 
 def _gates(gates: dict[str, int]) -> str:

@@ -31,6 +31,15 @@ _TRAINING_SOURCES = {
     "detections": "none: external detections",
     "tracks": "none: tracks were given",
 }
+_CURVES = {
+    "labels": "Precision and recall of the detector that this run trained on labelled frames of the flight. This run "
+    "measured them on",
+    "file": "Precision and recall of the detector file that was given. They were not measured on this flight, but when "
+    "the file was made, on the images that it was trained with:",
+    "shipped": "Precision and recall of the detector that ships with velfield. They were not measured on this flight, "
+    "but by the authors of velfield, on the labelled images that it was made with:",
+}
+"""Whose curve the report has, and where it is from, by the source of the training data."""
 
 
 def write_report(plan: Plan, summary: RunSummary, *, preview_of: str | None = None) -> list[str]:
@@ -90,6 +99,7 @@ def make_report(plan: Plan, summary: RunSummary) -> Report:
         ),
         residual=_residual(plan),
         detection=load_detector(plan.layout.detector).curve if plan.layout.detector.exists() else None,
+        detection_source=_CURVES.get(read_working(plan.layout).training_source, ""),
         gates=_gates(summary.stages),
         notes=tuple(note for stage in summary.stages for note in stage.notes),
         warnings=(
