@@ -3,7 +3,7 @@
 import L from "leaflet";
 import type { Geometry, Place } from "./analysis";
 import { toLatLng, toPoint, type Point } from "./coordinates";
-import { make } from "./dom";
+import { Labels } from "./labels";
 import type { Near, TrackIndex } from "./tracks";
 
 const MAX_TRACKS = 60;
@@ -13,10 +13,12 @@ export class Drawings {
   private readonly line = L.layerGroup();
   private readonly tracks = L.layerGroup();
   private readonly places = L.layerGroup();
+  private readonly labels: Labels;
   private readonly canvas = L.canvas({ padding: 0.2 });
 
   constructor(private readonly map: L.Map) {
     for (const group of [this.places, this.tracks, this.pixel, this.line]) group.addTo(map);
+    this.labels = new Labels(map);
   }
 
   showPixel(point: Point | null): void {
@@ -55,7 +57,8 @@ export class Drawings {
     this.places.clearLayers();
     for (const { geometry } of all) this.addGeometry(geometry, "#000", 4);
     for (const { geometry } of all) this.addGeometry(geometry, "#5ee0ff", 2);
-    for (const place of all) this.addLabel(place);
+    const first = all.filter(({ geometry }) => geometry === chosen);
+    this.labels.show([...first, ...all.filter(({ geometry }) => geometry !== chosen)]);
     if (!chosen) return;
     this.addGeometry(chosen, "#000", 9);
     this.addGeometry(chosen, "#fff", 5);
@@ -71,21 +74,6 @@ export class Drawings {
     else this.places.addLayer(L.polyline(points, options));
   }
 
-  private addLabel({ geometry: { type, xy_px }, label }: Place): void {
-    const middle = type === "LineString" ? Math.floor(xy_px.length / 2) : 0;
-    const [x, y] = type === "Polygon" ? centre(xy_px) : xy_px[middle]!;
-    const content = make("span", { class: "place-label" }, label);
-    if (type === "LineString" && middle) {
-      const [fromX, fromY] = xy_px[middle - 1]!;
-      const arrow = make("span", { class: "place-arrow" }, "➤");
-      arrow.style.transform = `rotate(${Math.atan2(y - fromY, x - fromX)}rad)`;
-      content.prepend(arrow);
-    }
-    if (!content.textContent) return;
-    const icon = L.divIcon({ className: "", html: content, iconSize: [0, 0] });
-    this.places.addLayer(L.marker(toLatLng(x, y), { icon, interactive: false, keyboard: false }));
-  }
-
   showTracks(near: Near[], index: TrackIndex | null): void {
     this.tracks.clearLayers();
     if (!index) return;
@@ -98,8 +86,4 @@ export class Drawings {
       this.tracks.addLayer(L.circleMarker(end, { ...options, radius: 3, color: "#000", weight: 1, fillColor: "#fff", fillOpacity: 1 }));
     }
   }
-}
-
-function centre(xy: [number, number][]): [number, number] {
-  return [0, 1].map((axis) => xy.reduce((sum, point) => sum + point[axis as 0 | 1], 0) / xy.length) as [number, number];
 }

@@ -23,10 +23,47 @@ export function makeMap(element: HTMLElement, run: Run): L.Map {
     zoomAnimation: !window.matchMedia("(prefers-reduced-motion: reduce)").matches,
   });
   map.fitBounds(whole);
+  keepInView(map, whole);
   new BaseTiles(run).addTo(map);
   new ScaleBar(run).addTo(map);
   map.getContainer().setAttribute("role", "application"); // arrow keys move the map, they do not read the page
   return map;
+}
+
+/**
+ * What is in view stays in view when the map's element changes its size, as where a wider panel takes its place; at its
+ * former size the map stands again as the user left it.
+ */
+function keepInView(map: L.Map, whole: L.LatLngBounds): void {
+  const view = () => ({ centre: map.getCenter(), zoom: map.getZoom(), size: map.getSize(), bounds: map.getBounds() });
+  let chosen = view(); // by the user
+  let fitted: typeof chosen | null = null; // by us, at another size
+  let size = map.getSize();
+  let moving = false;
+  map.on("resize", () => {
+    size = map.getSize();
+    if (!size.x || !size.y) return; // hidden
+    const asChosen = size.equals(chosen.size);
+    moving = true;
+    if (asChosen) map.setView(chosen.centre, chosen.zoom, { animate: false });
+    else map.setView(...fit(map, chosen.bounds, chosen.zoom, whole), { animate: false });
+    moving = false;
+    fitted = asChosen ? null : view();
+  });
+  map.on("moveend", () => {
+    const now = view();
+    // Leaflet ends a move before it tells of a new size, and perhaps once more after it.
+    if (moving || !now.size.equals(size) || (fitted && now.zoom === fitted.zoom && now.centre.equals(fitted.centre))) return;
+    [chosen, fitted] = [now, null];
+  });
+}
+
+/** Centre and zoom that show what of the map lies in these bounds, no closer than before. */
+function fit(map: L.Map, bounds: L.LatLngBounds, zoom: number, whole: L.LatLngBounds): [L.LatLng, number] {
+  const [south, west] = [Math.max(bounds.getSouth(), whole.getSouth()), Math.max(bounds.getWest(), whole.getWest())];
+  const [north, east] = [Math.min(bounds.getNorth(), whole.getNorth()), Math.min(bounds.getEast(), whole.getEast())];
+  const seen = L.latLngBounds([south, west], [north, east]);
+  return [seen.getCenter(), Math.min(zoom, map.getBoundsZoom(seen))];
 }
 
 /** A round length at the map's scale, in metres where they are known. */

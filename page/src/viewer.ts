@@ -459,7 +459,7 @@ async function start(): Promise<void> {
     explain("A browser reads no data from a file opened from the disk. Show this run with: velfield view RUN");
     return;
   }
-  showTab("map");
+  showTab(tab === "summary" ? "map" : tab); // the map needs a size to begin with
   try {
     viewer = new Viewer(await loadRun());
   } catch (error) {

@@ -402,6 +402,64 @@ def test_the_tab_of_the_analysis_shows_tables_with_n_and_intervals(chromium: Bro
         assert page.complaints == []
 
 
+LABELS = """[...document.querySelectorAll('#map .place-label')].filter((each) => each.checkVisibility()).map((each) =>
+  (({left, right, top, bottom}) => [each.textContent, left, right, top, bottom])(each.getBoundingClientRect()))"""
+
+
+@NEEDS_PAGE
+def test_no_label_of_the_analysis_covers_another(chromium: Browser, linked: Path, run: Run) -> None:
+    height, width = run.field.shape
+    x, y = width / 2, height / 2
+    lines = (
+        ((x - 150, y), (x + 150, y)),
+        ((x, y - 150), (x, y + 150)),  # crosses it in its middle: its label moves
+        ((x - 2, y), (x + 2, y)),  # has no other place: its label is left out
+    )
+    geometries = [GeometryRecord(type="LineString", xy_px=line) for line in lines]
+    rows = tuple(AnalysisRow(cells={"lane": k}, geometry=geometry) for k, geometry in enumerate(geometries))
+    table = made_analysis().tables[0].model_copy(update={"rows": rows})
+    (linked / "analysis").mkdir()
+    path = linked / "analysis" / "analysis.json"
+    path.write_text(made_analysis().model_copy(update={"tables": (table,)}).model_dump_json())
+    with served(linked) as there, chromium.page() as page:
+        page.open(f"{there}#tab=analysis&view={x},{y},0")
+        page.wait("document.querySelector('#analysis tbody') !== null")
+        shown = page.value(LABELS)
+        assert [text for text, *_ in shown] == ["➤0", "➤1"]
+        (_, left, right, top, bottom), (_, a, b, c, d) = shown
+        assert right < a or b < left or bottom < c or d < top
+        page.value("document.querySelectorAll('#analysis .place')[2].click()")  # the chosen one comes first
+        assert "➤2" in [text for text, *_ in page.value(LABELS)]
+        page.value("document.querySelector('.leaflet-control-zoom-out').click()")
+        page.wait("new URLSearchParams(location.hash.slice(1)).get('view').split(',')[2] < 0")
+        assert page.complaints == []
+
+
+@NEEDS_PAGE
+@pytest.mark.parametrize("width", [800, 1400])
+def test_the_map_shows_the_same_place_where_the_panel_is_wider(
+    chromium: Browser, linked: Path, run: Run, width: int
+) -> None:
+    (linked / "analysis").mkdir()
+    (linked / "analysis" / "analysis.json").write_text(made_analysis().model_dump_json())
+    view = "new URLSearchParams(location.hash.slice(1)).get('view')"
+    with served(linked) as there, chromium.page(width=width, height=900) as page:
+        page.open(there)
+        page.wait("document.querySelector('#layer option') !== null")
+        page.value("document.getElementById('whole').click()")
+        before = page.value(view)
+        page.value("document.getElementById('tab-analysis').click()")
+        page.wait("document.querySelector('#analysis tbody') !== null")
+        x, _, zoom = map(float, page.value(view).split(","))
+        half = page.value("map.clientWidth") / 2 / 2**zoom
+        assert x - half <= 0
+        assert x + half >= run.field.shape[1] - 1
+        for tab in ("summary", "analysis", "map"):
+            page.value(f"document.getElementById('tab-{tab}').click()")
+        assert page.value(view) == before
+        assert page.complaints == []
+
+
 BARE_EDGES = """[...document.querySelectorAll('.overlay canvas')].reduce(([painted, bare], canvas) => {
   const { width, height } = canvas;
   const { data } = canvas.getContext('2d').getImageData(0, 0, width, height);
