@@ -16,7 +16,7 @@ class ViewLayer(Model):
     name: str
     title: str
     description: str
-    """One sentence: what the numbers mean."""
+    """What the numbers mean, in a few short sentences."""
     kind: LayerKind
     arrays: tuple[str, ...] = Field(min_length=1, max_length=2)
     """Arrays of ``field.zarr``: one, or the x and y components of a velocity."""
@@ -105,5 +105,7 @@ class ViewRecord(Model):
     segments: ViewSegments
     replay: ViewReplay
     flow: ViewFlow
+    vehicles_for_percentile: dict[int, PositiveInt]
+    """Smallest number of vehicles of which the page shows a percentile of speed, by percentage: 15, 50, 85."""
     low_coverage_note: str = ""
     """A note for people where hardly any pixel was passed by several vehicles."""

@@ -3,11 +3,11 @@
 import type { Crossing } from "./crossings";
 import { arrow, make, pairs } from "./dom";
 import type { Point } from "./coordinates";
+import { cautionNote, isShown, PERCENTILES } from "./percentiles";
 import type { Run } from "./run";
 import { percentile, roundUp, ticks, type Units } from "./units";
 
 const FLOW_OF_S = 60; // in less a platoon may come or not
-const SURE_SPEEDS = 19; // fewer do not bound an 85th percentile
 const PLOT = { width: 280, height: 112, left: 10, bottom: 34, top: 6 };
 
 export function showLine(crossings: Crossing[], [start, end]: [Point, Point], run: Run, units: Units): HTMLElement {
@@ -24,7 +24,7 @@ export function showLine(crossings: Crossing[], [start, end]: [Point, Point], ru
   const top = roundUp(Math.max(...crossings.map((c) => c.speed * units.perPxPerS), 1));
   for (const direction of [1, -1] as const) {
     const part = crossings.filter((crossing) => crossing.direction === direction);
-    card.append(...oneWay(part, direction, across([start, end], direction), seconds, top, units));
+    card.append(...oneWay(part, direction, across([start, end], direction), top, run, units));
   }
   return card;
 }
@@ -38,8 +38,8 @@ function oneWay(
   part: Crossing[],
   direction: 1 | -1,
   across: number,
-  seconds: number,
   top: number,
+  run: Run,
   units: Units,
 ): HTMLElement[] {
   const speeds = part.map((crossing) => crossing.speed).sort((a, b) => a - b);
@@ -52,16 +52,15 @@ function oneWay(
     const attributes = { "data-name": `${name}_p${percent}`, "data-value": String(value) };
     return make("span", attributes, units.speedText(value));
   };
+  const shown = PERCENTILES.filter(([percent]) => isShown(percent, part.length, run));
   const rows: [string, Node | string][] = [
     ["Vehicles", count],
-    ["Flow", flowText(part.length, seconds)],
-    ["15th percentile", speed(15)],
-    ["Median speed", speed(50)],
-    ["85th percentile", speed(85)],
+    ["Flow", flowText(part.length, run.last_time_s - run.first_time_s)],
+    ...shown.map(([percent, label]): [string, Node] => [label, speed(percent)]),
   ];
-  const seen = part.length === 1 ? "One vehicle" : `${part.length} vehicles`;
-  const caution = make("p", { class: "note" }, `${seen} only: the percentiles are uncertain.`);
-  return [title, pairs(rows), ...(part.length < SURE_SPEEDS ? [caution] : []), bars(speeds.map((value) => value * units.perPxPerS), top, units.speed)];
+  const caution = cautionNote(part.length, "crossed this way", run);
+  const note = caution ? [make("p", { class: "note", "data-name": `${name}_caution` }, caution)] : [];
+  return [title, pairs(rows), ...note, bars(speeds.map((value) => value * units.perPxPerS), top, units.speed)];
 }
 
 function flowText(vehicles: number, seconds: number): string {

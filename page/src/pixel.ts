@@ -4,6 +4,7 @@ import { arrow, grid, make, pairs } from "./dom";
 import type { Field } from "./field";
 import type { Point } from "./coordinates";
 import { findModes, type Mode } from "./modes";
+import { cautionNote, isShown, PERCENTILES } from "./percentiles";
 import { polarPlot } from "./polar";
 import type { Near, TrackIndex } from "./tracks";
 import type { Units } from "./units";
@@ -26,15 +27,11 @@ const LAYERS = [
   "direction_ci90_half_width",
   "direction_se",
   "speed_p15",
-  "speed_p15_ci90_lower",
-  "speed_p15_ci90_upper",
   "speed_p50",
   "speed_p50_ci90_lower",
   "speed_p50_ci90_upper",
   "speed_se",
   "speed_p85",
-  "speed_p85_ci90_lower",
-  "speed_p85_ci90_upper",
   "stationary_fraction",
 ];
 /** A layer -> the better one that replaces it. */
@@ -68,6 +65,7 @@ export function showPixel(answer: PixelAnswer, field: Field, units: Units, away:
   }
   card.append(
     pairs(rows(answer, field, units)),
+    make("p", { class: "note", "data-name": "caution" }, [cautionNote(n, "passed here", field.run), errorNote(values)].join(" ").trim()),
     make("h3", {}, "Velocity distribution"),
     polarPlot(histogram, answer.modes, field.run, units),
     make("p", { class: "note" }, "Angle: direction on the map; radius: speed. Circles mark the modes."),
@@ -77,8 +75,6 @@ export function showPixel(answer: PixelAnswer, field: Field, units: Units, away:
       answer.modes.map((mode, k) => modeRow(mode, k, field, units)),
     ),
   );
-  const caution = n < 5 ? `${n === 1 ? "One vehicle" : `${n} vehicles`} only: the percentiles are uncertain. ` : "";
-  card.append(make("p", { class: "note" }, caution + errorNote(values)));
   return card;
 }
 
@@ -102,15 +98,9 @@ function rows({ n, values }: PixelAnswer, field: Field, units: Units): [string, 
     ["Direction", heading],
     ["Speed (mode)", speedCell("modal_speed", speed, values, units)],
   ];
-  for (const [name, label] of [
-    ["speed_p15", "15th percentile"],
-    ["speed_p50", "Median speed"],
-    ["speed_p85", "85th percentile"],
-  ] as const) {
-    const low = values[`${name}_ci90_lower`]; // of too few vehicles a percentile has no interval, and says nothing
-    if (name in values && (low === undefined || Number.isFinite(low))) {
-      listed.push([label, speedCell(name, values[name]!, values, units)]);
-    }
+  for (const [percent, label] of PERCENTILES) {
+    const name = `speed_p${percent}`;
+    if (name in values && isShown(percent, n, field.run)) listed.push([label, speedCell(name, values[name]!, values, units)]);
   }
   if ("stationary_fraction" in values) {
     const fraction = values.stationary_fraction!;
@@ -124,7 +114,7 @@ function speedCell(name: string, speed: number, values: Record<string, number>, 
   const shown = (pxPerS: number): string => (pxPerS * units.perPxPerS).toFixed(1);
   const [low, high] = [values[`${name}_ci90_lower`], values[`${name}_ci90_upper`]];
   if (low !== undefined && high !== undefined) {
-    if (Number.isFinite(low)) cell.append(make("span", { class: "error" }, ` ${shown(low)} to ${shown(high)}`));
+    cell.append(make("span", { class: "error" }, ` ${shown(low)} to ${shown(high)}`));
   } else if (name === "speed_p50") cell.append(plusMinus(values.speed_se, shown));
   return cell;
 }

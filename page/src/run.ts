@@ -40,6 +40,8 @@ export interface Run {
   segments: { count: number; tracks: number; hysteresis_px: number; band_radius_px: number };
   replay: { chunk_s: number; chunks: number; step_px: number; states: string[]; classes: string[] };
   flow: { cell_px: number; draws: number };
+  /** Smallest number of vehicles of which a percentile of speed is shown, by percentage. */
+  vehicles_for_percentile: Record<number, number>;
   /** A note for people where hardly any pixel was passed by several vehicles. */
   low_coverage_note: string;
 }

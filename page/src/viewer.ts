@@ -81,6 +81,7 @@ class Viewer {
     const { layer } = this;
     const legend = makeLegend(layer, this.run, this.units);
     find("legend").replaceChildren(legend.element);
+    find("layer").title = layer.description;
     this.overlay?.remove();
     const { minVehicles, opacity } = this.state;
     this.overlay = new Overlay(this.field, layer, legend.colourMax, minVehicles, opacity / 100, (error) => this.fail(error));
@@ -332,7 +333,9 @@ class Viewer {
   private fillControls(): void {
     const layers = find<HTMLSelectElement>("layer");
     const [main, more] = [make("optgroup", { label: "Main" }), make("optgroup", { label: "More" })];
-    for (const layer of this.run.layers) (layer.main ? main : more).append(make("option", { value: layer.name }, layer.title));
+    for (const layer of this.run.layers) {
+      (layer.main ? main : more).append(make("option", { value: layer.name, title: layer.description }, layer.title));
+    }
     layers.append(main, ...(more.childElementCount ? [more] : []));
     layers.value = this.layer.name;
     const unit = find<HTMLSelectElement>("unit");

@@ -17,6 +17,7 @@ from velfield.exports.export import export_run
 from velfield.pipeline.compare import compare_runs
 from velfield.pipeline.stages import report as report_step
 from velfield.run.layout import RunLayout
+from velfield.run.stores import open_field
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import OVERLAP_PX, TILE_PX, pyramid_levels, pyramid_tiles
 
@@ -49,6 +50,7 @@ def test_layers_follow_the_store() -> None:
     assert list(layers) == ["direction", "speed", "speed_change", "headway"]
     assert layers["speed_change"].kind == "change"
     assert layers["headway"].title == "Time between vehicles"
+    assert layers["speed_change"].description.startswith("Change of the median speed. The later field minus")
     assert layers["headway"].colour_max == pytest.approx(2.96)
 
 
@@ -71,6 +73,11 @@ def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None
     assert record.gsd_m == 0.23
     assert run.record.config.field.lane_width_m / 4 / 0.23 == pytest.approx(record.segments.band_radius_px)
     assert record.segments.tracks == len(np.unique(run.segments()["track"]))
+    store = open_field(layout.field)
+    assert all(layer.description for layer in record.layers)
+    for layer in record.layers:
+        if len(layer.arrays) == 1:  # in the store's own words
+            assert layer.description.lower().startswith(store.layer_attributes(layer.arrays[0])["long_name"].lower())
     for name, array in record.arrays.items():
         chunks = layout.root / array.store / name / "c"
         listed = set(zip(array.stored[::2], array.stored[1::2], strict=True))

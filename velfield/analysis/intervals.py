@@ -6,6 +6,7 @@ that of as many independent vehicles as tell as much.
 """
 
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +160,17 @@ def estimate_quantile(
 def _has_interval(n: float, q: float) -> bool:
     """Whether all of n independent values lie on one side of a quantile less often than its interval may miss it."""
     return bool(max(q, 1 - q) ** n <= (1 - LEVEL) / 2)
+
+
+def vehicles_for_quantile(q: float) -> int:
+    """Smallest number of independent vehicles of which the quantile ``q``, between 0 and 1, has an interval.
+
+    Examples
+    --------
+    >>> vehicles_for_quantile(0.5), vehicles_for_quantile(0.15), vehicles_for_quantile(0.85)
+    (5, 19, 19)
+    """
+    return next(n for n in count(MIN_VEHICLES) if _has_interval(n, q))
 
 
 def estimate_censored_quantile(

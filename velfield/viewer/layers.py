@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
 from schemas.view import LayerKind, ViewLayer
+from velfield.analysis.intervals import vehicles_for_quantile
 from velfield.report.figures import colour_scale_max
 
 _COLOUR_PERCENTILE = 98.0
@@ -21,67 +22,94 @@ _COLOUR_PERCENTILE = 98.0
 
 @dataclass(frozen=True)
 class _Known:
+    """A layer that is known here. It is explained by the ``long_name`` of its array, then by the hint; a velocity,
+    whose arrays are its components, by the hint alone."""
+
     name: str
     title: str
-    description: str
+    hint: str
     kind: LayerKind
     arrays: tuple[str, ...]
     main: bool = False
 
 
+_MODAL, _MEAN = ("modal_vx", "modal_vy"), ("mean_vx", "mean_vy")
+_NEEDED = f"Uncertain where fewer than {vehicles_for_quantile(0.85)} vehicles passed."
 _KNOWN = (
     _Known(
         "direction",
         "Direction",
-        "Direction of the largest mode, in which most vehicles go. No colour where they are stationary.",
+        "Direction of the most frequent velocity, in which most vehicles go. No colour where they are stationary.",
         "direction",
-        ("modal_vx", "modal_vy"),
+        _MODAL,
         True,
     ),
-    _Known("speed", "Speed", "Speed of the largest mode.", "speed", ("modal_vx", "modal_vy"), True),
-    _Known("speed_p85", "85th percentile speed", "85 % of vehicles are slower.", "speed", ("speed_p85",), True),
-    _Known("count", "Vehicles", "Number of vehicle tracks.", "count", ("count",), True),
+    _Known("speed", "Speed", "Speed of the most frequent velocity.", "speed", _MODAL, True),
+    _Known(
+        "speed_p85", "85th percentile speed", f"85 % of vehicles are slower. {_NEEDED}", "speed", ("speed_p85",), True
+    ),
+    _Known("count", "Vehicles", "A vehicle counts once at each pixel that it passes.", "count", ("count",), True),
     _Known(
         "direction_ci90_half_width",
         "Uncertainty of direction",
-        "Half the width of the 90 % confidence interval of the direction.",
+        "Small values mean that the layer Direction is accurate.",
         "angle",
         ("direction_ci90_half_width",),
         True,
     ),
-    _Known(
-        "speed_se",
-        "Uncertainty of speed",
-        "Standard error of the median speed; needs two vehicles.",
-        "speed",
-        ("speed_se",),
-        True,
-    ),
+    _Known("speed_se", "Uncertainty of speed", "Known from two vehicles on.", "speed", ("speed_se",), True),
     _Known("speed_p50", "Median speed", "Half of the vehicles are slower.", "speed", ("speed_p50",)),
-    _Known("speed_p15", "15th percentile speed", "15 % of vehicles are slower.", "speed", ("speed_p15",)),
+    _Known("speed_p15", "15th percentile speed", f"15 % of vehicles are slower. {_NEEDED}", "speed", ("speed_p15",)),
+    _Known("direction_se", "Standard error of direction", "Known from two vehicles on.", "angle", ("direction_se",)),
     _Known(
-        "direction_se",
-        "Standard error of direction",
-        "Of the mean direction of moving vehicles; needs two.",
-        "angle",
-        ("direction_se",),
+        "mean_direction",
+        "Mean direction",
+        "Direction of the mean velocity. Where vehicles go several ways, none may go this way.",
+        "direction",
+        _MEAN,
     ),
-    _Known("mean_direction", "Mean direction", "Direction of the mean velocity.", "direction", ("mean_vx", "mean_vy")),
     _Known(
         "stationary_fraction",
         "Fraction stationary",
-        "Fraction of vehicles that are stationary here: stop lines, queues, parking.",
+        "High at stop lines, in queues and where vehicles park.",
         "fraction",
         ("stationary_fraction",),
     ),
-    _Known("occupancy", "Occupancy", "Total time that vehicles spent here.", "time", ("occupancy_ms",)),
-    _Known("mode_fraction", "At the mode", "Fraction of vehicles at the largest mode.", "fraction", ("mode_fraction",)),
+    _Known("occupancy", "Occupancy", "Long where they queue or park.", "time", ("occupancy_ms",)),
+    _Known(
+        "mode_fraction",
+        "At the mode",
+        "100 %: all vehicles have the direction and speed of the layers Direction and Speed.",
+        "fraction",
+        ("mode_fraction",),
+    ),
     _Known(
         "circular_variance",
         "Variance of direction",
-        "Circular variance. 0: all go one way; 1: no preferred direction.",
+        "0: all go one way; 1: no preferred direction.",
         "plain",
         ("circular_variance",),
+    ),
+    _Known(
+        "entropy",
+        "Entropy of velocity",
+        "0: all vehicles have one velocity; the larger, the more their velocities differ.",
+        "plain",
+        ("entropy",),
+    ),
+    _Known(
+        "speed_p50_ci90_lower",
+        "Median speed, lower bound",
+        "The median of more such traffic is rarely lower.",
+        "speed",
+        ("speed_p50_ci90_lower",),
+    ),
+    _Known(
+        "speed_p50_ci90_upper",
+        "Median speed, upper bound",
+        "The median of more such traffic is rarely higher.",
+        "speed",
+        ("speed_p50_ci90_upper",),
     ),
 )
 _SPEED_SCALE = frozenset(
@@ -114,7 +142,7 @@ def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> li
         ViewLayer(
             name=layer.name,
             title=layer.title,
-            description=layer.description,
+            description=_explanation(layer, attributes),
             kind=layer.kind,
             arrays=layer.arrays,
             units=str(attributes[layer.arrays[0]].get("units", "1")),
@@ -134,8 +162,18 @@ def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
     title = str(attributes.get("long_name", name.replace("_", " ")))
     kind = _KINDS.get(str(attributes.get("units", "1")), "plain")
     change = "change" in name
-    about = "The later field minus the earlier one, where the difference is significant." if change else ""
-    return _Known(name, title[:1].upper() + title[1:], about, "change" if change else kind, (name,), change)
+    hint = "The later field minus the earlier one, where the difference is significant." if change else ""
+    return _Known(name, _capitalised(title), hint, "change" if change else kind, (name,), change)
+
+
+def _explanation(layer: _Known, attributes: Mapping[str, Mapping[str, Any]]) -> str:
+    """What a layer's numbers mean, in a few short sentences."""
+    name = "" if len(layer.arrays) > 1 else str(attributes[layer.arrays[0]].get("long_name", ""))
+    return " ".join(part for part in (f"{_capitalised(name)}." if name else "", layer.hint) if part)
+
+
+def _capitalised(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _magnitudes(arrays: Sequence[NDArray[Any]]) -> FloatArray:

@@ -20,9 +20,11 @@ from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewFlow, ViewLayer, ViewRecord, ViewReplay, ViewSegments
 from velfield.analysis.coverage import low_coverage_note
 from velfield.analysis.crossings import hysteresis_px
+from velfield.analysis.intervals import vehicles_for_quantile
 from velfield.analysis.vehicle_classes import CLASS_NAMES
 from velfield.analysis.vehicles import STATES
 from velfield.field.segments import Segments, band_radius_px, stationary_speed_px_per_s
+from velfield.field.statistics import PERCENTILES
 from velfield.run.commits import record_page, write_atomically
 from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.layout import RunLayout, remove_tree
@@ -145,6 +147,7 @@ def view_record(
             classes=CLASS_NAMES,
         ),
         flow=ViewFlow(cell_px=cell_side(store.shape, grid.gsd_m), draws=DRAWS),
+        vehicles_for_percentile={round(percent): vehicles_for_quantile(percent / 100) for percent in PERCENTILES},
         low_coverage_note=low_coverage_note(int((count > 0).sum()), int((count >= 5).sum())),
     )
 
