@@ -4,6 +4,7 @@ One folder, three parts: ``incoming/`` (flights), ``base-images/`` and ``runs/``
 and so is every flow run: whatever ends this process in order ends them.
 """
 
+import asyncio
 import contextlib
 import os
 import socket
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flows.console import print_with_time
+from flows.console import counted, print_with_time
 from flows.launch import PAGES, PAGES_OF
 from flows.stopping import end_children, stop_on_signals
 from velfield.errors import InputError
@@ -210,11 +211,11 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 @contextlib.contextmanager
 def pages(config: ServeConfig) -> Iterator[None]:
     """Serve the pages of the runs at the port after the UI's, to this machine only; artifacts link to them."""
-    from velfield.viewer.server import files_app, serve_in_thread
+    from velfield.viewer.server import runs_app, serve_in_thread
 
-    with serve_in_thread(files_app(config.runs), config.port + 1) as address:
+    with serve_in_thread(runs_app(config.runs), config.port + 1) as address:
         os.environ.update({PAGES: address, PAGES_OF: str(config.runs)})
-        print(f"pages       {address}/RUN/", flush=True)
+        print(f"pages       {address}", flush=True)
         yield
 
 
@@ -257,6 +258,22 @@ def watching(config: ServeConfig) -> Iterator[None]:
         thread.join(_STOP_S)
 
 
+def run_deployments(config: ServeConfig) -> None:
+    """Start the flow runs of the deployments as they come, until interrupted."""
+    from prefect.runner import Runner
+
+    class Interruptible(Runner):
+        """Prefect's own answer to SIGTERM calls a coroutine without awaiting it (3.8.8), so that nothing is stopped."""
+
+        def handle_sigterm(self, *_: Any, **__: Any) -> None:
+            raise KeyboardInterrupt
+
+    runner = Interruptible(pause_on_shutdown=False, limit=config.limit)
+    for deployment in deployments(config):
+        runner.add_deployment(deployment)
+    asyncio.run(runner.start())
+
+
 def serve_folder(config: ServeConfig) -> None:
     """Serve until interrupted; ends all child processes."""
     check(config)
@@ -269,12 +286,10 @@ def serve_folder(config: ServeConfig) -> None:
     stop_on_signals(resumes=False, grace_s=3 * _STOP_S)
     try:
         with server(config):
-            from prefect import serve
-
             from flows.stale import mark_abandoned
 
             if killed := mark_abandoned():
-                print_with_time(f"{killed} runs of processes that were killed are marked as crashed")
+                print_with_time(f"marked as crashed, as their processes were killed: {counted(killed, 'run')}")
             everywhere = f", port {config.port} of all its addresses" if config.host in ("0.0.0.0", "::") else ""
             print(f"Prefect UI  {config.url}{everywhere}", flush=True)
             for name, path in (
@@ -284,6 +299,6 @@ def serve_folder(config: ServeConfig) -> None:
             ):
                 print(f"{name:<12}{path}", flush=True)
             with watching(config), pages(config):
-                serve(*deployments(config), pause_on_shutdown=False, print_starting_message=False, limit=config.limit)
+                run_deployments(config)
     finally:
         end_children(_STOP_S)

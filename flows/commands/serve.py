@@ -60,7 +60,7 @@ def serve(
         limit=limit,
         cluster=str(cluster.resolve()) if cluster else "",
     )
-    with suppress(KeyboardInterrupt):  # Prefect answers most interrupts by returning
+    with suppress(KeyboardInterrupt):
         serve_folder(config)
     print("stopped; all processes ended")
     return 0

@@ -26,7 +26,7 @@ from velfield.report.viewer_page import page_is_built
 from velfield.run.layout import RunLayout, to_path
 from velfield.viewer.annotations import frames_to_annotate
 from velfield.viewer.annotator import annotate_app
-from velfield.viewer.server import files_app, serve_in_thread
+from velfield.viewer.server import runs_app, serve_in_thread
 
 
 def listening(*processes: psutil.Process) -> set[tuple[int, str, int]]:
@@ -41,7 +41,7 @@ def listening(*processes: psutil.Process) -> set[tuple[int, str, int]]:
 
 def test_pages_of_runs_are_served_to_this_machine_alone(tmp_path: Path) -> None:
     before = listening(psutil.Process())
-    with serve_in_thread(files_app(tmp_path), 0) as address:
+    with serve_in_thread(runs_app(tmp_path), 0) as address:
         opened = listening(psutil.Process()) - before
     assert {(ip, port) for _, ip, port in opened} == {("127.0.0.1", int(address.rpartition(":")[2]))}
 

@@ -25,7 +25,7 @@ from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.viewer.annotations import Frames, frames_to_annotate, read_marks, write_marks
 from velfield.viewer.annotator import annotate_app
-from velfield.viewer.server import page_policy, serve_in_thread, view_app
+from velfield.viewer.server import page_policy, runs_app, serve_in_thread, view_app
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -69,6 +69,30 @@ def folder(tmp_path: Path) -> Path:
     (root / "leak").symlink_to(tmp_path / "secret")
     (root / "out").symlink_to(tmp_path)
     return root
+
+
+def test_a_folder_of_runs_has_a_list_of_them(tmp_path: Path) -> None:
+    pages = ("a & b", "results", "street", "street/results/spring", "street/results/.summer.unfinished", ".hidden")
+    for name in pages:
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "index.html").write_text("<html></html>")
+    (tmp_path / "unfinished").mkdir()
+    with served(runs_app(tmp_path)) as client:
+        status, text, headers = client.ask("/")
+        assert (status, headers["content-type"]) == (200, "text/html; charset=utf-8")
+        assert headers["content-security-policy"].startswith("default-src 'none'")
+        links = dict(re.findall(r'<a href="(.*?)">(.*?)</a>', text))
+        assert links == {
+            "a%20%26%20b/": "a &amp; b",
+            "results/": "results",
+            "street/": "street",
+            "street/results/spring/": "street on spring",
+        }
+        for link in links:
+            assert client.status(f"/{link}") == 200, link
+        assert client.status("/", "POST") == 405
+        assert client.status("/", headers={"Host": "elsewhere.example"}) == 400
+        assert client.status("/unfinished/") == 404
 
 
 def test_files_of_the_folder_and_no_others(folder: Path) -> None:

@@ -1,21 +1,24 @@
 """A run folder over HTTP, for its page: read-only, on this machine alone.
 
-Files of the folder and no others: no listing, no link out of it, no hidden file, no method but GET and HEAD. Requests
-to another host name than this machine's own are refused, against DNS rebinding.
+Files of the folder and no others: no listing but that of runs in a folder of them, no link out of it, no hidden file,
+no method but GET and HEAD. Requests to another host name than this machine's own are refused, against DNS rebinding.
 """
 
 import re
 import socket
 import threading
+import time
 import webbrowser
 from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from hashlib import sha256
+from html import escape
 from os import environ
 from pathlib import Path
 from sys import platform
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from velfield.errors import InputError
 from velfield.run.flight_record import suggest_run
@@ -75,12 +78,51 @@ def view_app(root: Path) -> "Starlette":
 
             open_run(root).require_frames()
         raise InputError(f"{root} holds no index.html: {suggest_run(root)}")
-    return files_app(root)
-
-
-def files_app(root: Path) -> "Starlette":
-    """The server of a folder: a run's, or one of runs."""
     from starlette.applications import Starlette
+
+    return Starlette(routes=[_files(root)], middleware=[trusted_host_middleware()])
+
+
+def runs_app(root: Path) -> "Starlette":
+    """The server of a folder of run folders: a list of them, and their files."""
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import HTMLResponse
+    from starlette.routing import Route
+
+    def index(_request: Request) -> HTMLResponse:
+        html = _list_runs(root)
+        return HTMLResponse(html, headers=headers_for(html))
+
+    return Starlette(routes=[Route("/", index), _files(root)], middleware=[trusted_host_middleware()])
+
+
+_LIST_STYLE = "body{font:1rem sans-serif;margin:2rem}td{padding:.2rem 2rem .2rem 0}"
+_RESULT_PAGES = "results/[!.]*/index.html"
+
+
+def _list_runs(root: Path) -> str:
+    """HTML with a link to the page of each run and of each of its results, the newest run first."""
+    pages = sorted(root.glob("[!.]*/index.html"), key=lambda page: (-page.stat().st_mtime, page))
+    rows = [_list_page(root, page) for run in pages for page in (run, *sorted(run.parent.glob(_RESULT_PAGES)))]
+    table = f"<table>{''.join(rows)}</table>" if rows else "<p>No run is finished.</p>"
+    name = escape(str(root))
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Runs in {name}</title>'
+        f"<style>{_LIST_STYLE}</style><h1>Runs</h1><p>{name}</p>{table}</html>"
+    )
+
+
+def _list_page(root: Path, page: Path) -> str:
+    path = page.parent.relative_to(root).as_posix()
+    run, _, result = path.partition("/results/")
+    title = f"{run} on {result}" if result else run
+    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(page.stat().st_mtime))
+    return f'<tr><td><a href="{quote(path)}/">{escape(title)}</a></td><td>{when}</td></tr>'
+
+
+def _files(root: Path) -> Any:
+    """Route to the files of a folder."""
     from starlette.exceptions import HTTPException
     from starlette.routing import Mount
     from starlette.staticfiles import StaticFiles
@@ -97,7 +139,7 @@ def files_app(root: Path) -> "Starlette":
             response.headers.update(headers_for(file.read_text("utf-8") if file.suffix == ".html" else None))
             return response
 
-    return Starlette(routes=[Mount("/", RunFiles(directory=root, html=True))], middleware=[trusted_host_middleware()])
+    return Mount("/", RunFiles(directory=root, html=True))
 
 
 def trusted_host_middleware() -> Any:
