@@ -3,6 +3,7 @@ long stages."""
 
 import base64
 import os
+import re
 import shlex
 import time
 from pathlib import Path
@@ -15,6 +16,7 @@ from prefect.artifacts import (
     create_table_artifact,
     update_progress_artifact,
 )
+from prefect.runtime import flow_run
 
 from flows.launch import PAGES, PAGES_OF
 from schemas.summary import RunSummary
@@ -44,11 +46,12 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
         if image.exists() and image.stat().st_size <= _MAX_IMAGE_BYTES:
             data = base64.b64encode(image.read_bytes()).decode()
             lines += [f"## {name.capitalize()}", f"![modal {name}](data:image/png;base64,{data})", ""]
-    create_markdown_artifact(key="summary", markdown="\n".join(lines), description="Summary and maps")
+    create_markdown_artifact(key=_key("summary"), markdown="\n".join(lines), description=_of("summary and maps"))
     if (link := page_address(report)) is not None:
-        create_link_artifact(key="report", link=link, link_text="report", description="The run's page: map and report")
+        about = _of("page with map and report")
+        create_link_artifact(key=_key("report"), link=link, link_text="report", description=about)
     create_table_artifact(
-        key="stages",
+        key=_key("stages"),
         table=[
             {
                 "stage": s.name,
@@ -59,8 +62,20 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
             }
             for s in summary.stages
         ],
-        description="The stages of the run",
+        description=_of("stages"),
     )
+
+
+def _key(what: str) -> str:
+    """Key of an artifact of this run: under one key Prefect keeps versions of one thing, and lists the last.
+
+    Keys are of lower-case letters, digits and dashes; a run's name of other letters alone is in the description only.
+    """
+    return re.sub(r"[^a-z0-9]+", "-", f"{flow_run.name} {what}".lower()).strip("-")
+
+
+def _of(what: str) -> str:
+    return f"{flow_run.name}: {what}"
 
 
 def page_address(report: Path) -> str | None:
@@ -87,7 +102,7 @@ class LongStage:
         self._updated_s = now_s
         percent = 100.0 * min(done / self._steps, 1.0)
         if self._artifact is None:
-            key, about = f"progress-{self._stage}", f"{self._stage}, per cent"
+            key, about = _key(f"progress {self._stage}"), _of(f"{self._stage}, per cent")
             self._artifact = UUID(str(create_progress_artifact(percent, key=key, description=about)))
         else:
             update_progress_artifact(self._artifact, percent)

@@ -5,11 +5,12 @@ from itertools import count
 from pathlib import Path
 
 from prefect import flow, get_run_logger
+from prefect.runtime import flow_run
 
 from flows.artifacts import page_address
-from flows.console import Console, print_with_time
+from flows.console import Console, counted, print_with_time
 from flows.launch import prepare_process
-from flows.prefect_flows import end_state
+from flows.prefect_flows import end_state, refused
 from flows.process_flight import run_flight
 from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig, read_runner
@@ -21,7 +22,16 @@ from velfield.pipeline.watch import find_image, inputs_of, newest_image, run_fol
 from velfield.run.layout import RunLayout, to_path
 
 
-@flow(name="process-dropped-flight", flow_run_name="{source}", persist_result=False)
+def _name_of_dropped() -> str:
+    return Path(flow_run.parameters["source"]).name
+
+
+def _name_of_reprocess() -> str:
+    given = flow_run.parameters
+    return f"{given.get('run') or 'all runs'} on {given.get('base') or 'the newest base image'}"
+
+
+@flow(name="process-dropped-flight", flow_run_name=_name_of_dropped, persist_result=False)
 def process_dropped(source: str, runs: str, cluster: str = "") -> object:
     """Process a flight that was dropped into the watched folder.
 
@@ -38,20 +48,22 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> object:
     prepare_process(verbose=False)
     try:
         summary = _run_dropped(Path(source), Path(runs), _runner(cluster))
-    except Exception as error:  # in the terminal too: else nothing there follows "has arrived"
-        why = str(error) if isinstance(error, InputError) else one_line(error)
-        print_with_time(f"{Path(source).name} failed: {why}")
+    except InputError as error:  # in the terminal too: else nothing there follows "has arrived"
+        print_with_time(f"{Path(source).name} failed: {error}")
+        return refused(error)
+    except Exception as error:
+        print_with_time(f"{Path(source).name} failed: {one_line(error)}")
         raise
     for line in summary.frames_lost:
         get_run_logger().warning(line)
     lost = "" if summary.complete else f", but {summary.loss}"
     report = RunLayout(Path(summary.root)).report
-    print_with_time(f"{Path(source).name} is done{lost}: {page_address(report) or report.as_uri()}")
+    _tell(f"{Path(source).name} is done{lost}: {page_address(report) or report.as_uri()}")
     return summary.root if summary.complete else end_state(summary)
 
 
-@flow(name="reprocess-runs", flow_run_name="{base}", persist_result=False)
-def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", cluster: str = "") -> list[str]:
+@flow(name="reprocess-runs", flow_run_name=_name_of_reprocess, persist_result=False)
+def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", cluster: str = "") -> object:
     """Reprocess one run, or all, on a new base image; runs of another place are left unchanged.
 
     Parameters
@@ -68,24 +80,40 @@ def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", c
         Cluster file. Default: the threads of this process.
     """
     prepare_process(verbose=False)
+    try:
+        return _reprocess(to_path(runs), Path(base_images), base, run, _runner(cluster))
+    except InputError as error:
+        print_with_time(f"reprocessing failed: {error}")
+        return refused(error)
+
+
+def _reprocess(runs: Path, base_images: Path, base: str, run: str, runner: RunnerConfig) -> list[str]:
     logger = get_run_logger()
-    image = find_image(Path(base_images), base) if base else newest_image(Path(base_images))
+    image = find_image(base_images, base) if base else newest_image(base_images)
     if image is None:
         logger.info("no base image has arrived in %s", base_images)
         return []
-    made, refused = [], []
-    for root in run_folders(to_path(runs), run):
+    results, made, unchanged = [], 0, 0
+    for root in run_folders(runs, run):
         try:
-            folder, _ = run_reprocess(root, image, runner=_runner(cluster), console=Console("quiet"))
-            made.append(str(folder))
+            folder, summary = run_reprocess(root, image, runner=runner, console=Console("quiet"))
+            results.append(str(folder))
+            made += summary is not None
         except InputError as error:
             if run:
                 raise
-            refused.append(root.name)
+            unchanged += 1
             logger.warning("%s is unchanged: %s", root.name, error)
-    print_with_time(f"{image.name}: {len(made)} results made, {len(refused)} runs unchanged")
-    logger.info("%s: %d results made, %d runs unchanged", image.name, len(made), len(refused))
-    return made
+    text = f"{image.name}: {counted(made, 'result')} made, {len(results) - made} already there, "
+    text += f"{counted(unchanged, 'run')} unchanged"
+    _tell(text)
+    return results
+
+
+def _tell(text: str) -> None:
+    """A line in the terminal and in the log of the flow run, where that of the runs that it started is not shown."""
+    print_with_time(text)
+    get_run_logger().info("%s", text)
 
 
 def _runner(cluster: str) -> RunnerConfig:

@@ -24,8 +24,30 @@ class Orchestration(ABC):
     """Runs a flow, and its units as tasks."""
 
     @abstractmethod
-    def run(self, flow: Callable[[], T], *, name: str, run_name: str, threads: int, parameters: Any) -> T:
-        """The result of a flow, which may submit tasks, so many of them at once; ``parameters``: to show with it."""
+    def run(
+        self, flow: Callable[[], T], *, name: str, folder: str, result: str = "", threads: int, parameters: Any
+    ) -> T:
+        """The result of a flow, which may submit tasks.
+
+        Parameters
+        ----------
+        name
+            The flow's name.
+        folder
+            Path of the run folder from the root on: two runs on a folder `RUN` of two places must not be taken for one.
+            The run is shown by the folder's name.
+        result
+            Name of the result within the folder that the flow makes; empty: the folder's own.
+        threads
+            Number of tasks that run at a time.
+        parameters
+            What is shown with the run.
+
+        Raises
+        ------
+        InputError
+            As the flow raises it.
+        """
 
     @abstractmethod
     def submit(
@@ -44,8 +66,8 @@ class Orchestration(ABC):
         """
 
     @abstractmethod
-    def mark_killed(self, run_name: str) -> None:
-        """Mark earlier runs of this name as ended: they were killed. Call while holding the run folder's lock."""
+    def mark_killed(self, folder: str) -> None:
+        """Mark earlier runs of this folder as ended: they were killed. Call while holding the folder's lock."""
 
     @abstractmethod
     def show_progress(self, stage: str, steps: int) -> Callable[[int], None]:
@@ -59,7 +81,9 @@ class Orchestration(ABC):
 class Threads(Orchestration):
     """Threads of this process; nothing is shown."""
 
-    def run(self, flow: Callable[[], T], *, name: str, run_name: str, threads: int, parameters: Any) -> T:
+    def run(
+        self, flow: Callable[[], T], *, name: str, folder: str, result: str = "", threads: int, parameters: Any
+    ) -> T:
         with ThreadPoolExecutor(threads, name) as self._pool:
             return flow()
 
@@ -68,7 +92,7 @@ class Threads(Orchestration):
     ) -> "Future[T]":
         return self._pool.submit(_call_with_retries, do, retries)
 
-    def mark_killed(self, run_name: str) -> None:
+    def mark_killed(self, folder: str) -> None:
         pass  # nothing remembers them
 
     def show_progress(self, stage: str, steps: int) -> Callable[[int], None]:

@@ -49,16 +49,12 @@ def run_flow(
     runner: RunnerConfig,
     console: Console,
 ) -> RunSummary:
-    """Run a flow of one job with as many concurrent units as the runner can use.
-
-    It is named by its folder from the root on: by a folder as it is given, two runs on a folder `RUN` of two places
-    would be one, and one that was killed could not be distinguished from one that lives.
-    """
+    """Run a flow of one job with as many concurrent units as the runner can use."""
     by = choose_orchestration()
     return by.run(
         lambda: flow(job, runner, console, by),
         name=name,
-        run_name=absolute(job.root),
+        folder=absolute(job.root),
         threads=parallel_units(runner),
         parameters=job,
     )

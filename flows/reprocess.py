@@ -5,8 +5,10 @@ frame is decoded, registered or searched for cars. Where it does not, or with ``
 again.
 """
 
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from flows.console import Console
 from flows.orchestration import Orchestration
@@ -68,7 +70,8 @@ def run_reprocess(
     return by.run(
         lambda: reprocess(run, image, chosen, limit_px, where, console or Console("normal"), by),
         name="reprocess",
-        run_name=f"{run} on {chosen}",
+        folder=run,
+        result=chosen,
         threads=parallel_units(where),
         parameters={"run": run, "base": image, "name": chosen, "full": full},
     )
@@ -82,7 +85,7 @@ def reprocess(
     run = open_run(root)
     run.require_frames()
     with locked(run.layout, stop_lost):
-        by.mark_killed(f"{root} on {name}")
+        by.mark_killed(root)
         if result_exists(run.layout, name, Path(base)):
             console.event("start", f"{run.layout.results / name} is the result on this base image already")
             return publish_result(run, name, Path(base)), None
@@ -92,7 +95,7 @@ def reprocess(
             summary = (
                 _again(run, job, runner, console, by)
                 if found is None
-                else _mapped(run, job, found, runner, console, by)
+                else _mapped(run, job, *found, runner, console, by)
             )
         except InputError:
             remove_tree(to_path(job.root))
@@ -118,10 +121,14 @@ def _new_job(run: Run, name: str, base: str) -> Job:
     return Job(root=str(staging_layout(run.layout, name).root), inputs=inputs, config=run.record.config)
 
 
-def _registered(run: Run, base: str, limit_px: float, console: Console, by: Orchestration) -> RebaseRecord | None:
-    """The registration of the new image to the old base image; none, with a warning, where it is not good enough."""
+def _registered(
+    run: Run, base: str, limit_px: float, console: Console, by: Orchestration
+) -> tuple[RebaseRecord, "Future[Any]"] | None:
+    """The registration of the new image to the old base image, and the task that measured it; none, with a warning,
+    where it is not good enough."""
     name = "new base image on the old one"
-    found = by.submit(lambda: measure_rebase(run, Path(base)), name=name, run_name=name).result()
+    measured = by.submit(lambda: measure_rebase(run, Path(base)), name=name, run_name=name)
+    found = measured.result()
     if isinstance(found, Failure):
         console.warn(
             f"the new base image does not register to the old one, so the frames are registered again: {found.reason}"
@@ -134,7 +141,7 @@ def _registered(run: Run, base: str, limit_px: float, console: Console, by: Orch
         )
         return None
     console.event("start", found.text())
-    return found
+    return found, measured
 
 
 def _again(run: Run, job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:
@@ -145,7 +152,13 @@ def _again(run: Run, job: Job, runner: RunnerConfig, console: Console, by: Orche
 
 
 def _mapped(
-    run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, console: Console, by: Orchestration
+    run: Run,
+    job: Job,
+    found: RebaseRecord,
+    measured: "Future[Any]",
+    runner: RunnerConfig,
+    console: Console,
+    by: Orchestration,
 ) -> RunSummary:
     layout = RunLayout(Path(job.root))
     link_shared_outputs(run.layout, layout, _names(NewBase.SHARED), without=("base/",))
@@ -155,7 +168,7 @@ def _mapped(
     write_flight_record(plan)
     with open_runner(runner, console.warn) as where:
         work = Work(plan, where, console, by, at_once=parallel_units(runner))
-        _run_stages(work, Rebase(run.layout, found))
+        _run_stages(work, Rebase(run.layout, found), measured)
         summary = summarise_run(plan, work.summaries)
         publish_report(plan, summary, where, console, by)
     return summary
@@ -165,10 +178,11 @@ def _names(new_base: NewBase) -> list[str]:
     return [stage.name for stage in STAGES if stage.new_base is new_base]
 
 
-def _run_stages(work: Work, rebase: Rebase) -> None:
+def _run_stages(work: Work, rebase: Rebase, measured: "Future[Any]") -> None:
     graph = partial(rebase_graph, rebase=rebase)
     for stage in STAGES:
         if stage.new_base in (NewBase.SHARED, NewBase.COUNTS):
             work.carry_over(stage)
         else:
-            work.run([stage], graph, essential=True)
+            reads = [measured] if stage.new_base is NewBase.MAPPED else []
+            work.run([stage], graph, essential=True, after=reads)

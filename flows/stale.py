@@ -1,7 +1,6 @@
 """Flow runs that were killed stay "Running" in Prefect for ever, unless they are marked as crashed."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, FlowRunFilterStateType
@@ -9,23 +8,24 @@ from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.runtime import flow_run
 from prefect.states import Crashed
 
+from schemas.job import absolute
 from velfield.run.layout import RunLayout, to_path
 from velfield.run.lock import holder_is_gone
 
 _PAGE = 200
-_S3 = "s3:/"
+_S3 = "s3://"
 _RESUMED = "the process was killed; the next run of this folder resumed from its commits"
 _ENDED = "the process was killed; the same command resumes from its commits"
 
 
-def mark_crashed(name: str) -> int:
-    """Mark runs that Prefect believes to be running as crashed: earlier ones of this name, any whose process ended.
+def mark_crashed(folder: str) -> int:
+    """Mark runs that Prefect believes to be running as crashed: earlier ones of this folder, any whose process ended.
 
     Call while holding the run folder's lock: then no other run on it can be alive. Returns how many.
     """
-    own, remote = str(flow_run.id), name.startswith(_S3)
-    return _mark(lambda run: str(run.id) != own and run.name == name, _RESUMED) + _mark(
-        lambda run: str(run.id) != own and run.name != name and _is_abandoned(run, remote=remote), _ENDED
+    own, remote = str(flow_run.id), folder.startswith(_S3)
+    return _mark(lambda run: str(run.id) != own and _folder_of(run) == folder, _RESUMED) + _mark(
+        lambda run: str(run.id) != own and _folder_of(run) != folder and _is_abandoned(run, remote=remote), _ENDED
     )
 
 
@@ -38,14 +38,23 @@ def mark_abandoned() -> int:
 
 
 def _is_abandoned(run: FlowRun, *, remote: bool) -> bool:
-    """Whether a run is named after a folder (`RUN`, or `RUN on BASE`) whose lock's holder has ended.
+    """Whether the holder of the lock of a run's folder has ended.
 
     S3 is asked only by who works on it (``remote``): another process has no credentials for it, or waits in vain.
     """
-    name = run.name.split(" on ")[0]
-    if name.startswith(_S3):
-        return remote and holder_is_gone(RunLayout(to_path(name)))
-    return Path(name).is_absolute() and holder_is_gone(RunLayout(Path(name)))
+    folder = _folder_of(run)
+    if folder is None or (folder.startswith(_S3) and not remote):
+        return False
+    return holder_is_gone(RunLayout(to_path(folder)))
+
+
+def _folder_of(run: FlowRun) -> str | None:
+    """Path of the run folder from the root on, as `Orchestration.run` was given it; None for flows of other programs.
+
+    The run's name is that of the folder alone, which folders of other places have too.
+    """
+    folder = run.parameters.get("run_folder")
+    return folder if isinstance(folder, str) and absolute(folder) == folder else None
 
 
 def _mark(is_dead: Callable[[FlowRun], bool], message: str) -> int:

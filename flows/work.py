@@ -91,7 +91,12 @@ class Work:
         self._given = self.plan
 
     def run(
-        self, stages: Sequence[Stage] = STAGES, graph: GraphOf = unit_graph, *, essential: bool | None = None
+        self,
+        stages: Sequence[Stage] = STAGES,
+        graph: GraphOf = unit_graph,
+        *,
+        essential: bool | None = None,
+        after: Sequence[Future[Any]] = (),
     ) -> None:
         """Compute all units of some stages, stage by stage in the order of the table.
 
@@ -104,6 +109,8 @@ class Work:
             The Dask graph of a unit.
         essential
             Nothing can follow without these stages: their failure is the run's. Default: as the table says.
+        after
+            Tasks that have ended, whose results every unit reads besides those of the stages before it.
         """
         with self.console.stages() as bars:
             try:
@@ -112,7 +119,7 @@ class Work:
                         self._restart_before(stage)
                     steps = "frames" if stage.cut is Cut.BY_FRAMES else "steps"
                     progress = bars.add(stage.name, stage.label, steps)
-                    self._compute(self._start(stage, progress, essential), graph)
+                    self._compute(self._start(stage, progress, essential), graph, after)
             except BaseException:
                 self.console.print_warnings()
                 raise
@@ -122,13 +129,13 @@ class Work:
                 while self._running or self._beside is not None:
                     self._next_end()
 
-    def _compute(self, under_way: UnderWay, graph: GraphOf) -> None:
+    def _compute(self, under_way: UnderWay, graph: GraphOf, after: Sequence[Future[Any]]) -> None:
         """Compute the units of a stage: no more of them are submitted than run at once, and a few."""
         left = [k for k in range(len(under_way.units)) if k not in under_way.ended]
         while left or self._running:
             self._submit_aside()
             while left and self._running < self.at_once + _QUEUED - (self._beside is not None):
-                self._submit(under_way, left.pop(0), graph)
+                self._submit(under_way, left.pop(0), graph, after)
             k = self._next_end()
             if k is not None:
                 self._end(under_way, k)
@@ -198,7 +205,7 @@ class Work:
         summary = summarise_stage(stage.name, records, units=len(records), before=records, seconds=0.0)
         self.summaries.append(summary)
 
-    def _submit(self, under_way: UnderWay, k: int, graph: GraphOf) -> None:
+    def _submit(self, under_way: UnderWay, k: int, graph: GraphOf, after: Sequence[Future[Any]]) -> None:
         plan, stage, unit = under_way.plan, under_way.stage, under_way.units[k]
         record, failed = under_way.records[k], ""
 
@@ -218,7 +225,7 @@ class Work:
             name=stage.label,
             run_name=label,
             retries=self.plan.config.work.retries,
-            after=self._upstream(under_way, k),
+            after=[*after, *self._upstream(under_way, k)],
         )
         under_way.futures[k] = future
         self._running += 1

@@ -137,7 +137,7 @@ def test_with_an_auth_string_prefects_api_asks_for_it(server: None) -> None:
         assert client.status("/admin/version", headers=header("somebody:secret")) == 200
 
 
-def test_a_run_is_named_by_its_folder_from_the_root_on(
+def test_a_run_is_known_by_its_folder_from_the_root_on(
     flight: Path, server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As `--out RUN` gives it, one that was killed was never marked, and one of another place's `RUN` was."""
@@ -147,9 +147,10 @@ def test_a_run_is_named_by_its_folder_from_the_root_on(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="nowhere"):
         process(job(flight, Path("RUN {x}"), timestamps="nowhere"))
-    named = FlowRunFilter(name=FlowRunFilterName(any_=[str(tmp_path / "RUN {x}")]))
+    named = FlowRunFilter(name=FlowRunFilterName(any_=["RUN {x}"]))
     with get_client(sync_client=True) as client:
-        assert len(client.read_flow_runs(flow_run_filter=named)) == 1
+        (run,) = client.read_flow_runs(flow_run_filter=named)
+    assert run.parameters["run_folder"] == str(tmp_path / "RUN {x}")
 
 
 def test_a_run_on_s3_whose_lease_expired_is_crashed_once_another_works_there(server: None, s3: None) -> None:
@@ -169,7 +170,8 @@ def test_a_run_on_s3_whose_lease_expired_is_crashed_once_another_works_there(ser
         for name, until_s in (("killed", time.time() - 5), ("alive", time.time() + 60)):
             root = to_path(f"s3://flights/servers/{name}")
             RunLayout(root).lock.write_bytes(json.dumps(owner | {"until_s": until_s}).encode())
-            runs[name] = client.create_flow_run(nothing, name=str(root), state=Running())
+            folder = {"run_folder": f"s3://flights/servers/{name}"}
+            runs[name] = client.create_flow_run(nothing, name=name, parameters=folder, state=Running())
         assert mark_abandoned() == 0  # a server on this machine does not ask S3
         assert mark_crashed("s3://flights/servers/another") == 1
         states = {name: client.read_flow_run(run.id).state_name for name, run in runs.items()}
@@ -191,16 +193,20 @@ def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: No
 
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         ended.wait()
-    pids = {"killed": ended.pid, "alive": os.getpid(), "resumed": os.getpid()}
+    pids = {"killed": ended.pid, "alive": os.getpid(), "resumed": os.getpid(), "elsewhere/resumed": os.getpid()}
     with get_client(sync_client=True) as client:
         runs = {}
         for name, pid in pids.items():
-            (tmp_path / name).mkdir()
+            (tmp_path / name).mkdir(parents=True)
             owner = {"pid": pid, "host": socket.gethostname(), "machine": machine_id()}
             (tmp_path / name / ".lock").write_text(json.dumps(owner))
-            runs[name] = client.create_flow_run(nothing, name=str(tmp_path / name), state=Running())
+            root = tmp_path / name
+            folder = {"run_folder": str(root)}
+            runs[name] = client.create_flow_run(nothing, name=root.name, parameters=folder, state=Running())
         assert mark_crashed(str(tmp_path / "resumed")) == 2
         states = {name: client.read_flow_run(run.id).state_name for name, run in runs.items()}
-        assert states == {"killed": "Crashed", "alive": "Running", "resumed": "Crashed"}
+        left = {"alive": "Running", "elsewhere/resumed": "Running"}
+        assert states == left | {"killed": "Crashed", "resumed": "Crashed"}
         assert mark_abandoned() == 0
-        client.delete_flow_run(runs["alive"].id)
+        for name in left:
+            client.delete_flow_run(runs[name].id)

@@ -27,6 +27,7 @@ def test_three_kills_and_the_same_bits(
     assert met >= 2
     assert digests(tmp_path / "run") == digests(whole[0])
     with get_client(sync_client=True) as client:
-        states = [run.state_name for run in client.read_flow_runs() if run.name == str(tmp_path / "run")]
+        runs = client.read_flow_runs()
+        states = [run.state_name for run in runs if run.parameters.get("run_folder") == str(tmp_path / "run")]
     # A kill in the first seconds leaves no flow run at all, one in the last a run that is done.
     assert set(states) == {"Completed", "Crashed"}

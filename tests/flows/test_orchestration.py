@@ -1,7 +1,10 @@
 """Flows on threads of this process, and as Prefect shows them: the same results, retries and errors."""
 
+import logging
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -47,7 +50,7 @@ def test_what_may_pass_is_tried_again_and_its_error_is_kept(by: Orchestration, e
     def flow() -> BaseException | None:
         return by.submit(fail, name="fails", run_name="fails 0", retries=2).exception(60)
 
-    found = by.run(flow, name="flow", run_name="flow {x}", threads=2, parameters={"a": 1})
+    found = by.run(flow, name="flow", folder="/flow {x}", threads=2, parameters={"a": 1})
     assert (type(found), str(found)) == (type(error), str(error))
     assert len(calls) == attempts
 
@@ -58,7 +61,7 @@ def test_tasks_read_those_before(by: Orchestration) -> None:
         assert first.result(60) == 1
         return by.submit(lambda: 2, name="two", run_name="two", after=[first]).result(60)
 
-    assert by.run(flow, name="flow", run_name="flow", threads=1, parameters=None) == 2
+    assert by.run(flow, name="flow", folder="/flow", threads=1, parameters=None) == 2
 
 
 def test_a_run_that_lost_frames_is_shown_as_incomplete(server: None) -> None:
@@ -73,7 +76,7 @@ def test_a_run_that_lost_frames_is_shown_as_incomplete(server: None) -> None:
     assert (shown.name, shown.is_completed()) == ("Incomplete", True)
     assert str(shown.message).startswith("incomplete: 1 frames and 1 units lost")
     by = choose_orchestration()
-    assert by.run(lambda: summary, name="flow", run_name="flow", threads=1, parameters=None) is summary
+    assert by.run(lambda: summary, name="flow", folder="/flow", threads=1, parameters=None) is summary
     whole = RunSummary(root="RUN", stages=())
     assert end_state(whole) is whole
 
@@ -83,7 +86,70 @@ def test_an_error_of_the_flow_is_raised(by: Orchestration) -> None:
         raise InputError("no such file")
 
     with pytest.raises(InputError, match="no such file"):
-        by.run(refuse, name="flow", run_name="flow", threads=1, parameters=None)
+        by.run(refuse, name="flow", folder="/flow", threads=1, parameters=None)
+
+
+@contextmanager
+def errors_logged() -> Iterator[list[logging.LogRecord]]:
+    """Records of errors that the logs of flow runs and task runs receive."""
+    found: list[logging.LogRecord] = []
+
+    class Keep(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            found.append(record)
+
+    handler = Keep(logging.ERROR)
+    loggers = [logging.getLogger(name) for name in ("prefect.flow_runs", "prefect.task_runs")]
+    for logger in loggers:
+        logger.addHandler(handler)
+    yield found
+    for logger in loggers:
+        logger.removeHandler(handler)
+
+
+def test_bad_input_is_one_line_of_the_log_and_the_state_of_the_run(server: None, tmp_path: Path) -> None:
+    from prefect.client.orchestration import get_client
+
+    by = choose_orchestration()
+
+    def refuse() -> None:
+        raise InputError(f"no such file as {tmp_path}")
+
+    with errors_logged() as logged, pytest.raises(InputError, match="no such file"):
+        by.run(refuse, name="flow", folder=str(tmp_path), threads=1, parameters=None)
+    assert [(record.getMessage(), record.exc_info) for record in logged] == [(f"no such file as {tmp_path}", None)]
+    with get_client(sync_client=True) as client:
+        (run,) = [one for one in client.read_flow_runs() if one.parameters.get("run_folder") == str(tmp_path)]
+    assert run.state is not None
+    assert (run.state.name, run.state.message) == ("Failed", f"no such file as {tmp_path}")
+    assert run.name == tmp_path.name
+    assert set(run.tags) == {"flow", tmp_path.name}
+
+
+def test_bad_input_of_a_unit_is_one_line_of_its_log(server: None) -> None:
+    by = choose_orchestration()
+
+    def refuse() -> None:
+        raise InputError("no such file")
+
+    def flow() -> None:
+        by.submit(refuse, name="refuses", run_name="refuses").result(60)
+
+    with errors_logged() as logged, pytest.raises(InputError, match="no such file"):
+        by.run(flow, name="flow", folder="/flow", threads=1, parameters=None)
+    assert [record.exc_info for record in logged] == [None, None]  # the unit's, and the run's
+    assert all("no such file" in record.getMessage() for record in logged)
+
+
+def test_other_errors_keep_their_traceback(server: None) -> None:
+    by = choose_orchestration()
+
+    def fail() -> None:
+        raise ValueError("a bug")
+
+    with errors_logged() as logged, pytest.raises(ValueError, match="a bug"):
+        by.run(fail, name="flow", folder="/flow", threads=1, parameters=None)
+    assert [record.exc_info[0] for record in logged if record.exc_info is not None] == [ValueError]
 
 
 @pytest.mark.parametrize(

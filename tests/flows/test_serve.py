@@ -35,6 +35,7 @@ from schemas.summary import RunSummary
 from tests.browser import browser
 from velfield.errors import InputError
 from velfield.pipeline.plan import OtherFlightError
+from velfield.pipeline.stage import STAGES, NewBase
 from velfield.pipeline.watch import FolderWatcher, find_image, inputs_of, newest_image, run_folders, run_name
 from velfield.run.layout import to_path
 
@@ -124,7 +125,13 @@ def test_all_addresses_with_a_password(tmp_path: Path) -> None:
     ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     environment = {**ours, "PREFECT_HOME": str(tmp_path / "home"), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "flows.cli", "serve", str(tmp_path), "--host", "0.0.0.0", "--port", str(port)]
-    with subprocess.Popen([*command, "--auth", AUTH], env=environment, stdout=subprocess.PIPE, text=True) as process:
+    errors = (tmp_path / "errors").open("w+")
+    with (
+        errors,
+        subprocess.Popen(
+            [*command, "--auth", AUTH], env=environment, stdout=subprocess.PIPE, stderr=errors, text=True
+        ) as process,
+    ):
         try:
             assert process.stdout is not None
             told = process.stdout.readline().strip()
@@ -146,6 +153,11 @@ def test_all_addresses_with_a_password(tmp_path: Path) -> None:
                 assert "Can't connect" not in page.value("document.body.innerText")
                 others = [one for one in page.requests if not one.startswith((url, "data:", "blob:"))]
                 assert others == []  # no other host is told that somebody looks
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(60) == 0
+            assert process.stdout.read().splitlines()[-1] == "stopped; all processes ended"
+            errors.seek(0)
+            assert "Warning" not in errors.read()
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(60)
@@ -357,14 +369,50 @@ def test_from_the_event_to_the_finished_reprocess(served: Served, flight: Path) 
     }
     served.ask("/events", [event])
     wait_for(lambda: "COMPLETED" in served.states().values() or "FAILED" in served.states().values())
-    assert served.states() == {".spring.png": "COMPLETED"}
+    assert served.states() == {"main-street on .spring.png": "COMPLETED"}
     results = json.loads((served.folder / "runs/main-street/results.json").read_text())["results"]
     assert [(result["name"], result["how"]) for result in results] == [("first", "run"), ("spring", "mapped")]
-    (link,) = served.ask("/artifacts/filter", {"artifacts": {"key": {"any_": ["report"]}}})
+    (link,) = served.ask("/artifacts/filter", {"artifacts": {"key": {"any_": ["main-street-on-spring-report"]}}})
+    assert link["description"] == "main-street on spring: page with map and report"
     address = re.fullmatch(r"\[report\]\((http://127\.0\.0\.1:\d+/main-street/\S+)\)", link["data"])
     assert address is not None, link["data"]
     with urllib.request.urlopen(address[1], timeout=30) as answer:
         assert b"<title>" in answer.read()
+    with urllib.request.urlopen(address[1].partition("/main-street/")[0], timeout=30) as answer:
+        assert b'href="main-street/"' in answer.read()
+    _mapped_stages_read_the_new_base_image(served)
+
+
+def _mapped_stages_read_the_new_base_image(served: Served) -> None:
+    """In the graph, from the one task that registers the new image to the old one."""
+    (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"tags": {"all_": ["reprocess", "main-street", "spring"]}}})
+    asked = {"flow_runs": {"id": {"any_": [run["id"]]}}}
+    wait_for(lambda: "maps" in [task["name"] for task in served.ask("/task_runs/filter", asked)])
+    tasks = served.ask("/task_runs/filter", asked)
+    (measured,) = [task["id"] for task in tasks if task["name"] == "new base image on the old one"]
+    readers = {
+        task["name"].split()[0]
+        for task in tasks
+        if measured in [one["id"] for inputs in task["task_inputs"].values() for one in inputs if "id" in one]
+    }
+    mapped = {stage.label.split()[0] for stage in STAGES if stage.new_base is NewBase.MAPPED}
+    assert readers == mapped
+
+
+def test_bad_input_is_one_line_in_the_log_of_a_deployed_run(served: Served) -> None:
+    """Prefect's engine logs a traceback of its own for a deployed run that failed."""
+    (found,) = [one for one in served.ask("/deployments/filter", {}) if one["name"] == "base-image-arrived"]
+    parameters = found["parameters"] | {"base": "none.png"}
+    run = served.ask(f"/deployments/{found['id']}/create_flow_run", {"parameters": parameters})
+    wait_for(lambda: served.ask(f"/flow_runs/{run['id']}")["state"]["type"] in ("FAILED", "COMPLETED", "CRASHED"))
+    state = served.ask(f"/flow_runs/{run['id']}")["state"]
+    text = f"{served.folder / 'base-images/none.png'} does not exist; base images are taken from "
+    text += f"{served.folder / 'base-images'} only"
+    assert (state["name"], state["message"]) == ("Failed", text)
+    asked = {"logs": {"flow_run_id": {"any_": [run["id"]]}, "level": {"ge_": 40}}}
+    wait_for(lambda: served.ask("/logs/filter", asked) != [])
+    time.sleep(5)  # what is logged last arrives last: twice the time for which Prefect keeps lines
+    assert [line["message"] for line in served.ask("/logs/filter", asked)] == [text]
 
 
 _BLINKS = """if True:
@@ -397,7 +445,7 @@ def test_the_ui_shows_graph_retry_and_artifacts(
     (root / "commits/tracklets/000008-000015.json").unlink()
     environment = {**os.environ, "PREFECT_API_URL": f"{served.url}/api", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", _BLINKS, str(flight), str(root)], env=environment, check=True)
-    (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [str(root)]}}})
+    (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": ["blinks"]}}})
     tasks = served.ask("/task_runs/filter", {"flow_runs": {"id": {"any_": [run["id"]]}}})
     (twice,) = [task for task in tasks if task["run_count"] > 1]
     assert twice["name"] == "tracklets 000008-000015"
@@ -412,7 +460,7 @@ def test_the_ui_shows_graph_retry_and_artifacts(
         assert "Retry 1/1 will start" in page.value("document.body.innerText")
         (summary,) = served.ask(
             "/artifacts/filter",
-            {"flow_runs": {"id": {"any_": [run["id"]]}}, "artifacts": {"key": {"any_": ["summary"]}}},
+            {"flow_runs": {"id": {"any_": [run["id"]]}}, "artifacts": {"key": {"any_": ["blinks-summary"]}}},
         )
         page.open(f"{served.url}/artifacts/artifact/{summary['id']}")
         page.wait("document.querySelectorAll('img[src^=data]').length == 2")
