@@ -62,18 +62,18 @@ def test_clips_are_timed_with_nothing_given(
 ) -> None:
     name = "480p H.265"
     monkeypatch.setattr("velfield.bench.clips.CLIPS", {"480p H.264": (640, 480), name: (640, 480)})
-    clip = make_clip(name, tmp_path, 45)
+    clip = make_clip(name, tmp_path, 24)
     monkeypatch.setattr("velfield.bench.clips.CLIPS", {name: (640, 480)})
-    assert speed(frames=45, preset="fast", parts=("clips",), work=tmp_path) == 0
+    assert speed(frames=24, preset="fast", parts=("clips",), work=tmp_path) == 0
     told = capsys.readouterr().out
-    assert f"{name}, 45 frames, " in told
+    assert f"{name}, 24 frames, " in told
     for line in (
         r"^frames +[\d.]+ s, +[\d.]+ s of processor",
         r"libav alone, all frames: [\d.]+ s",
         r"velfield run: [\d.]+ s",
     ):
         assert len(re.findall(line, told, re.MULTILINE)) == 1
-    assert probe(clip, frames=FramesConfig(every=1)).frame_count == 45
+    assert probe(clip, frames=FramesConfig(every=1)).frame_count == 24
 
 
 def test_memory_is_that_of_the_driver_and_of_the_largest_worker() -> None:
