@@ -109,17 +109,6 @@ class StageBars:
             progress.at_least(progress.done + steps)
 
 
-def counted(number: int, noun: str) -> str:
-    """A number of things.
-
-    Examples
-    --------
-    >>> counted(1, "result"), counted(2, "result")
-    ('1 result', '2 results')
-    """
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def print_with_time(text: str) -> None:
     """Print a line with the time of day, from a process that serves."""
     print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)

@@ -8,14 +8,14 @@ from prefect import flow, get_run_logger
 from prefect.runtime import flow_run
 
 from flows.artifacts import page_address
-from flows.console import Console, counted, print_with_time
+from flows.console import Console, print_with_time
 from flows.launch import prepare_process
 from flows.prefect_flows import end_state, refused
 from flows.process_flight import run_flight
 from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig, read_runner
 from schemas.summary import RunSummary
-from velfield.errors import InputError, one_line
+from velfield.errors import InputError, count_text, one_line
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import OtherFlightError
 from velfield.pipeline.watch import find_image, inputs_of, newest_image, run_folders, run_name
@@ -104,8 +104,8 @@ def _reprocess(runs: Path, base_images: Path, base: str, run: str, runner: Runne
                 raise
             unchanged += 1
             logger.warning("%s is unchanged: %s", root.name, error)
-    text = f"{image.name}: {counted(made, 'result')} made, {len(results) - made} already there, "
-    text += f"{counted(unchanged, 'run')} unchanged"
+    text = f"{image.name}: {count_text(made, 'result')} made, {len(results) - made} already there, "
+    text += f"{count_text(unchanged, 'run')} unchanged"
     _tell(text)
     return results
 

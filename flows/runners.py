@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from pydantic import Field, PositiveInt, ValidationError
 
 from schemas.model import Model
-from velfield.errors import InputError, one_line
+from velfield.errors import InputError, count_text, one_line
 from velfield.parallel import usable_processors
 from velfield.pipeline.graphs import compute_here
 from velfield.pipeline.stage import load_kernels, load_stages
@@ -170,7 +170,7 @@ class ClientRunner(Runner):
         workers = self._count_workers()
         self._address = str(client.scheduler.address)
         self._lock, self._without_since_s = threading.Lock(), float("inf")
-        self.description = f"Dask at {self._address}, {workers} worker{'' if workers == 1 else 's'}"
+        self.description = f"Dask at {self._address}, {count_text(workers, 'worker')}"
 
     def compute(self, graph: Any) -> Any:
         return self._wait(self._client.compute(graph))

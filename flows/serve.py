@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flows.console import counted, print_with_time
+from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
 from flows.stopping import end_children, stop_on_signals
-from velfield.errors import InputError
+from velfield.errors import InputError, count_text
 from velfield.pipeline.watch import FolderWatcher, is_flight, is_telemetry
 
 if TYPE_CHECKING:
@@ -289,7 +289,7 @@ def serve_folder(config: ServeConfig) -> None:
             from flows.stale import mark_abandoned
 
             if killed := mark_abandoned():
-                print_with_time(f"marked as crashed, as their processes were killed: {counted(killed, 'run')}")
+                print_with_time(f"marked as crashed, as their processes were killed: {count_text(killed, 'run')}")
             everywhere = f", port {config.port} of all its addresses" if config.host in ("0.0.0.0", "::") else ""
             print(f"Prefect UI  {config.url}{everywhere}", flush=True)
             for name, path in (

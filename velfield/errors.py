@@ -1,4 +1,4 @@
-"""Errors and warnings: bad input, a damaged run, a full disk, a frame or chunk that fails; and four warnings."""
+"""Errors and warnings, and words of messages: bad input, a damaged run, a full disk, a frame or chunk that fails."""
 
 import errno
 import json
@@ -63,6 +63,17 @@ def one_line(error: object) -> str:
     ('two lines', 'TimeoutError')
     """
     return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+def count_text(n: int, noun: str) -> str:
+    """A number and its noun.
+
+    Examples
+    --------
+    >>> count_text(1, "lane"), count_text(2, "lane")
+    ('1 lane', '2 lanes')
+    """
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def parse_json(data: str | bytes) -> Any:

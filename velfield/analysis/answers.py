@@ -13,6 +13,7 @@ from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import JunctionSignal, Queue, green_duration_s, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
+from velfield.errors import count_text
 
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
@@ -294,17 +295,6 @@ def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
     fewer = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
     text = f"none in {duration_text(seconds)}, so fewer than {fewer} an hour with 90 % probability"
     return Answer(topic, "", "none", text, at_most_per_h=hourly)
-
-
-def count_text(n: int, noun: str) -> str:
-    """A number and its noun.
-
-    Examples
-    --------
-    >>> count_text(1, "lane"), count_text(2, "lane")
-    ('1 lane', '2 lanes')
-    """
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def lanes_text(lanes: Sequence[int]) -> str:

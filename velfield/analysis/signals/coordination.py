@@ -10,6 +10,7 @@ from schemas.arrays import FloatArray
 from velfield.analysis.intervals import Estimate, estimate_mean
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.signals.cycles import JunctionSignal, StreamSignal, queues
+from velfield.errors import count_text
 
 _STEP_S = 10.0
 _MIN_CYCLES = 3
@@ -79,7 +80,7 @@ def find_offsets(
     """
     known = [(signal, signal.cycle_s) for signal in signals.values() if signal.signalised and signal.cycle_s]
     if len(known) < 2:
-        return [], f"No offsets: {len(known)} junction{'' if len(known) == 1 else 's'} with a signal of a fixed cycle."
+        return [], f"No offsets: {count_text(len(known), 'junction')} with a signal of a fixed cycle."
     follow = False
     out, cycles = [], sorted({round(cycle.value, 1) for _, cycle in known})
     for (a, cycle_a), (b, cycle_b) in permutations(known, 2):

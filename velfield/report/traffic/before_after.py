@@ -4,11 +4,12 @@ from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
 
-from velfield.analysis.answers import count_text, duration_text
+from velfield.analysis.answers import duration_text
 from velfield.analysis.changes import FDR_LEVEL, Change, common_junctions
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.errors import count_text
 from velfield.report.drawing import figure_bytes, new_figure
 from velfield.report.traffic.diagrams import draw_turning
 from velfield.report.traffic.report import DPI, STYLE

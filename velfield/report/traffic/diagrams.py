@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.export import PER_M_PER_S, SpeedUnit
-from velfield.analysis.answers import count_text
 from velfield.analysis.flow.conflicts import LIKELY
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.movements.movements import MIN_PASSES, JunctionMovements
 from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.errors import count_text
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, lane_names
 
 if TYPE_CHECKING:

@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import count_text, duration_text, find_answers, longest_queues, queue_text
+from velfield.analysis.answers import duration_text, find_answers, longest_queues, queue_text
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import Queue
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.errors import count_text
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, compare_delays
 
 _PER_QUESTION = 4
