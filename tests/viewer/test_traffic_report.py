@@ -49,6 +49,16 @@ def test_a_short_clip_is_answered_by_what_is_missing() -> None:
     assert {d.name for d in traffic_diagrams(short, None)} <= {"place", "speed-profile"}
 
 
+def test_of_lanes_that_merge_it_does_not_say_that_there_is_no_junction() -> None:
+    road, ramp = np.array([[0.0, 0.0], [200.0, 0.0]]), np.array([[0.0, 50.0], [90.0, 0.0], [200.0, 0.0]])
+    merging = TrafficAnalysis(
+        gather([drive(road, 9.0 * k) for k in range(9)] + [drive(ramp, 9.0 * k) for k in range(9)])
+    )
+    assert merging.movements
+    answers = dict(first_page(merging).answers)
+    assert answers["Is there a signal, and is it fair?"] == ("Not known: no junction was found where lanes cross.",)
+
+
 def test_every_diagram_is_drawn_and_two_pdfs_are_the_same(analysis: TrafficAnalysis) -> None:
     made = list(traffic_diagrams(analysis, np.full((1100, 1300), 128, np.uint8), unit="mph"))
     kinds = {re.sub(r"-\d+$", "", diagram.name) for diagram in made}

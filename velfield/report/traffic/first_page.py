@@ -66,6 +66,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
 
     events = [f"{name}: {text}" for topic, name in _EVENTS.items() for text in found.get(topic, [])[:1]]
     no_junction = "no junction of lanes was found"
+    no_signal = "no junction was found where lanes cross" if analysis.movements else no_junction
     questions = (
         (
             "Where do vehicles go?",
@@ -77,7 +78,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
             waits,
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
-        ("Is there a signal, and is it fair?", found.get("signal", []), why("signal", no_junction)),
+        ("Is there a signal, and is it fair?", found.get("signal", []), why("signal", no_signal)),
         (
             "How fast do vehicles drive?",
             found.get("speed", []) or found.get("mean speed", []),
