@@ -145,7 +145,7 @@ def _write(
     bins = VelocityBins.from_config(config, grid.gsd_m)
     files = set[Path]()
     for group in tile_groups(grid, config):
-        files |= _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins), kinds, combine)
+        files |= _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins, zeros=[]), kinds, combine)
     digest_outputs(layout, files)  # which sees to it that they are on the disk
     write_atomically(layout.flight, record.model_dump_json(indent=1).encode())  # last: without it nothing is whole
 

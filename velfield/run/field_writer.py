@@ -107,15 +107,23 @@ class GroupWriter:
     """Writes one group of tiles: each tile when it is put, the layers when the group is closed."""
 
     def __init__(
-        self, store: FieldStore, group: Group, *, grid: GridRecord, config: FieldConfig, bins: VelocityBins
+        self,
+        store: FieldStore,
+        group: Group,
+        *,
+        grid: GridRecord,
+        config: FieldConfig,
+        bins: VelocityBins,
+        zeros: list[NDArray[np.int32]],
     ) -> None:
+        """``zeros``: histograms of zeros, kept from one writer to the next."""
         self.store, self.group, self.config, self.bins = store, group, config, bins
         self.side = config.tile_size_px * GROUP_TILES
         self.y0, self.x0 = group[0] * self.side, group[1] * self.side
         self.height, self.width = min(self.side, grid.height_px - self.y0), min(self.side, grid.width_px - self.x0)
         self.touched: list[tuple[int, int]] = []
         self._writes: deque[Future[NDArray[np.int32]]] = deque()
-        self._zeros: list[NDArray[np.int32]] = []
+        self._zeros = zeros
         self.layers: dict[str, NDArray[Any]] = {
             name: np.full((self.height, self.width), fill_value(layer.dtype), layer.dtype)
             for name, layer in LAYERS.items()
@@ -144,6 +152,7 @@ class GroupWriter:
         for k, histogram in enumerate(self._zeros):
             if histogram.shape == shape:
                 return self._zeros.pop(k)
+        self._zeros.clear()  # of another shape, as at the map's edge
         return np.zeros(shape, np.int32)
 
     def put(self, row: int, column: int, tile: FieldTile, time_weighted: FieldTile | None = None) -> None:
@@ -153,7 +162,8 @@ class GroupWriter:
         """
         histograms = [(HISTOGRAM, tile)] + ([] if time_weighted is None else [(HISTOGRAM_TIME_WEIGHTED, time_weighted)])
         if not tile.count.any():
-            self._zeros += [one.histogram for _, one in histograms]
+            for _, one in histograms:
+                self._keep(one.histogram)
             return
         self.touched.append((row, column))
         x, y = self.origin_xy(row, column)
@@ -163,8 +173,12 @@ class GroupWriter:
             self.layers[name][window] = values
         for name, one in histograms:
             if len(self._writes) == _WRITES_AT_ONCE:
-                self._zeros.append(self._writes.popleft().result())
+                self._keep(self._writes.popleft().result())
             self._writes.append(_writers.submit(self._write, row, column, one, name))
+
+    def _keep(self, zeros: NDArray[np.int32]) -> None:
+        if len(self._zeros) < _WRITES_AT_ONCE:
+            self._zeros.append(zeros)
 
     def _write(self, row: int, column: int, tile: FieldTile, name: str) -> NDArray[np.int32]:
         """Write a histogram, then fill it with zeros."""
@@ -178,8 +192,7 @@ class GroupWriter:
     def close(self) -> None:
         """Wait for the tiles, and write the layers."""
         while self._writes:
-            self._writes.popleft().result()
-        self._zeros.clear()
+            self._keep(self._writes.popleft().result())
         layers = [_writers.submit(self.store.write_layer, name, self.group, one) for name, one in self.layers.items()]
         for layer in layers:
             layer.result()

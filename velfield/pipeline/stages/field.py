@@ -82,7 +82,7 @@ def accumulate_block(plan: Plan, block: Group) -> StageResult:
     """Fill one block of groups of tiles, of the field and of its time intervals."""
     grid, config = read_grid(plan.layout), plan.config.field
     bins, weight = VelocityBins.from_config(config, grid.gsd_m), field_weight(config)
-    make = partial(GroupWriter, grid=grid, config=config, bins=bins)
+    make = partial(GroupWriter, grid=grid, config=config, bins=bins, zeros=[])
     store = open_field(plan.layout.field, "r+")
     writers = [make(store, group) for group in _list_groups(plan, block)]
     segments = _segments_near(plan, writers)
