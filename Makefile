@@ -20,10 +20,11 @@ IN_TWO := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 # Two processes on two cores: BLAS threads of their own make training in the tests many times slower.
 test: export OPENBLAS_NUM_THREADS := 1
 test: export OMP_NUM_THREADS := 1
+# While one processor checks the types the other compiles the kernels, which both processes of the tests would do.
 test: page  ## every check: lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/python -m velfield.pipeline.local & kernels=$$!; $(BIN)/mypy && wait $$kernels || { kill $$kernels; exit 1; }
 	$(BIN)/python -m pytest $(IN_TWO)
 
 # In build/newest and build/oldest, without the lock: what somebody gets who installs the wheel today, or beside old
