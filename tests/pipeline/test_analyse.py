@@ -82,6 +82,7 @@ def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str
     assert re.search(r"signal +junction \d: cycle 40.0 s \(\d", text)
     assert re.search(r"junction \d, W to E: \d+ vehicles, \d+ % \(\d+ to \d+\) of \d+ from W", text)
     assert re.search(r"u-turns +none in \d.* min, so fewer than \d", text)
+    assert "directions  N: the top of the image\n" in text
 
 
 def test_arms_have_the_names_that_are_given(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

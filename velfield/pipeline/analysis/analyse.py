@@ -226,13 +226,14 @@ def write_analysis(
 
 
 def answer_lines(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iterator[str]:
-    """A line for each answer, `MAX_LINES` of a topic: those with the most vehicles."""
+    """A line for each answer, `MAX_LINES` of a topic: those with the most vehicles; then what N stands for."""
     for topic, group in groupby(find_answers(analysis, unit=unit), key=lambda answer: answer.topic):
         found = list(group)
         for answer in found[:MAX_LINES]:
             yield f"{topic:11} {answer.subject}{': ' if answer.subject else ''}{answer.text}"
         if len(found) > MAX_LINES:
             yield f"{'':11} and {len(found) - MAX_LINES} more"
+    yield f"directions  {analysis.arm_names.legend}"
 
 
 def _explain_empty(table: AnalysisTable, analysis: TrafficAnalysis) -> AnalysisTable:
