@@ -85,6 +85,17 @@ def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str
     assert "directions  N: the top of the image\n" in text
 
 
+def test_the_time_is_that_of_all_rows_where_few_vehicles_drive_for_a_part_of_it(tmp_path: Path) -> None:
+    """Vehicles an hour of a minute in which some drive would be twice what two minutes show."""
+    rows = [(0, t, 50.0, 30.0) for t in np.arange(0.0, 120.0, 0.5)]  # it stands
+    rows += [(k, 30 + 5 * k + t, 10 * t, 0.0) for k in range(1, 6) for t in np.arange(0.0, 10.0, 0.5)]
+    lines = [f"{k},{t:.1f},{x:.2f},{y:.2f}" for k, t, x, y in rows]
+    (tmp_path / "tracks.csv").write_text("\n".join(["track_id,time_s,x_m,y_m", *lines]))
+    analyse(tracks=tmp_path / "tracks.csv", out=tmp_path / "out")
+    record = AnalysisRecord.model_validate_json((tmp_path / "out" / "analysis.json").read_text())
+    assert (record.tracks, record.duration_s) == (5, 119.5)
+
+
 def test_arms_have_the_names_that_are_given(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tracks, out = folder.parent / "tracks.csv", folder.parent / "named"
     junctions = LanesRecord.model_validate_json((folder / "lanes.json").read_text()).junctions

@@ -53,6 +53,8 @@ class Trajectories:
         Standard deviation of a position along one axis, of errors that last; 0: less than a lane's width matters to.
     gaps_s
         (k, 2) begins and ends of longer times without frames, as between clips, in time order; None: there are none.
+    seen_s
+        Times of the first and the last frame; None: not known, those of the first and the last position.
     """
 
     track_id: IntArray
@@ -65,6 +67,7 @@ class Trajectories:
     measured_length_m: FloatArray | None = None
     position_sd_m: float = 0.0
     gaps_s: FloatArray | None = None
+    seen_s: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -98,15 +101,17 @@ class Trajectories:
 
     @property
     def window_s(self) -> tuple[float, float]:
-        """First and last time of all tracks."""
+        """First and last time that is seen."""
+        if self.seen_s is not None:
+            return self.seen_s
         return (float(self.time_s.min()), float(self.time_s.max())) if len(self.time_s) else (0.0, 0.0)
 
     @property
     def observed_s(self) -> FloatArray:
-        """(k, 2) begins and ends of the times with frames, from the first position of all tracks to the last."""
-        if not len(self.time_s):
-            return np.empty((0, 2))
+        """(k, 2) begins and ends of the times with frames."""
         begin, end = self.window_s
+        if end <= begin:
+            return np.empty((0, 2))
         gaps = np.empty((0, 2)) if self.gaps_s is None else self.gaps_s
         gaps = gaps[(gaps[:, 0] > begin) & (gaps[:, 1] < end)]
         return np.column_stack([np.r_[begin, gaps[:, 1]], np.r_[gaps[:, 0], end]])
@@ -144,6 +149,7 @@ class Trajectories:
             None if self.measured_length_m is None else self.measured_length_m[keep],
             self.position_sd_m,
             self.gaps_s,
+            self.seen_s,
         )
 
 

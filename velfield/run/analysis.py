@@ -50,7 +50,7 @@ class RunAnalysis:
     position_sd_m
         Standard deviation of a position along one axis, of tracks of another program.
     frame_times
-        Returns the times (n,) of the frames, s; None: not known.
+        Returns the times (n,) of the registered frames, s; None: not known.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
@@ -66,7 +66,7 @@ class RunAnalysis:
     def trajectories(self) -> Trajectories:
         """Tracks of vehicles that move, in metres."""
         made = from_tracklets(self.tracklets(), self.gsd_m)
-        known = replace(made, position_sd_m=self.position_sd_m, gaps_s=self._gaps_s)
+        known = self._with_frames(replace(made, position_sd_m=self.position_sd_m))
         return moving(known).with_lengths(self.dimensions())
 
     @cached_property
@@ -78,14 +78,14 @@ class RunAnalysis:
         names = ArmNames(north_direction_rad(self.grid))
         return TrafficAnalysis(self.trajectories, parked=parked, classes=self._classes, arm_names=names)
 
-    @property
-    def _gaps_s(self) -> FloatArray | None:
-        """Begins and ends (k, 2) of the times between clips."""
-        if self.frame_times is None:
-            return None
-        times = self.frame_times()
+    def _with_frames(self, tracks: Trajectories) -> Trajectories:
+        """Tracks with the times that are seen: a road may be empty when the first frame is taken, and the last."""
+        times = np.empty(0) if self.frame_times is None else self.frame_times()
+        if not len(times):
+            return replace(tracks, seen_s=tracks.window_s)  # of those that stand too
         before = np.flatnonzero(np.diff(times) > _GAP_S)
-        return np.column_stack([times[before], times[before + 1]])
+        gaps_s = np.column_stack([times[before], times[before + 1]])
+        return replace(tracks, gaps_s=gaps_s, seen_s=(float(times[0]), float(times[-1])))
 
     @property
     def _classes(self) -> VehicleClasses | None:

@@ -308,8 +308,13 @@ class Run:
             self._dimensions,
             self.vehicles,
             position_sd_m,
-            (lambda: self.times_s) if self.has_frames else None,
+            self._registered_s if self.has_frames else None,
         )
+
+    def _registered_s(self) -> FloatArray:
+        """(n,) times of the frames that are registered, s: of others nothing is seen on the map."""
+        ok = np.array([status == "ok" for status in self.registration_status], np.bool_)
+        return np.asarray(self.times_s[ok])
 
     @cached_property
     def base_image(self) -> GreyImage:

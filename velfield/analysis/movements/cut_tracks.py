@@ -145,6 +145,7 @@ def _chain(trajectories: Trajectories, before: IntArray) -> CutTracks:
         trajectories.gsd_m,
         position_sd_m=trajectories.position_sd_m,
         gaps_s=trajectories.gaps_s,
+        seen_s=trajectories.seen_s,
     )
     gap = np.full(n, np.nan)
     later = before[track] >= 0
