@@ -95,16 +95,17 @@ def _half_width(variance: float, typical: float, pseudocount: float, tracks: flo
 
 @kernel
 def _median_speed(
-    cells: FloatArray, total: float, variance: float, tracks: float, measurement_variance: float, blur: float
+    cells: FloatArray, total: float, median: float, factor: float, variance: float, tracks: float, measured: float
 ) -> tuple[float, float]:
-    """90 % interval of the median speed, bins, by the cells of speed, their sum and the variance of the speed."""
-    median = quantile(cells, total, 0.5)
-    typical = measurement_variance + (TYPICAL_SPEED_SD * median) ** 2 + MIN_SPEED_SD_BINS**2
-    own = max(variance - blur, 0.0)
-    half_width = MEDIAN_SE_RATIO * _half_width(own, typical, SPEED_PSEUDOCOUNT, tracks, SPEED_CORRELATION)
+    """90 % interval of a median speed, bins, by the cells of speed and their sum.
+
+    ``factor``: `deconvolution_factor`. ``variance``: of the speed, without the kernel's. ``measured``: mean variance of
+    a measured velocity component.
+    """
+    typical = measured + (TYPICAL_SPEED_SD * median) ** 2 + MIN_SPEED_SD_BINS**2
+    half_width = MEDIAN_SE_RATIO * _half_width(variance, typical, SPEED_PSEUDOCOUNT, tracks, SPEED_CORRELATION)
     n_effective = max(tracks / (1.0 + SPEED_CORRELATION * (min(tracks, PLATOON_SIZE) - 1.0)), 1.0)
     rank = 0.5 * _Z / sqrt(n_effective + 2.0)
-    factor = deconvolution_factor(variance, blur)
     below = factor * (median - quantile(cells, total, 0.5 - rank))
     above = factor * (quantile(cells, total, 0.5 + rank) - median)
     return max(median - max(half_width, below), 0.0), median + max(half_width, above)
@@ -308,7 +309,9 @@ def _tile(
             measured = variance_bins2[y, x]
             mode_x, mode_y = mode_x - reach, mode_y - reach
             out.modes[y, x, 0], out.modes[y, x, 1] = mode_x, mode_y
-            out.median[y, x, 0], out.median[y, x, 1] = _median_speed(cells, total, variance, n, measured, blur)
+            out.median[y, x, 0], out.median[y, x, 1] = _median_speed(
+                cells, total, median, factor, max(variance - blur, 0.0), n, measured
+            )
             if hypot(mode_x, mode_y) > stationary:
                 of_bins = sigma * sigma + 1.0 / 12.0
                 out.errors[y, x, 2] = _modal_direction(h, box, mode_x, mode_y, n, measured, of_bins)

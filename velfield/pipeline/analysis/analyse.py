@@ -141,7 +141,7 @@ def analyse_tracks(
     ids, frames = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
     time_s = table["time_s"].to_numpy(np.float64)
     made = make_trajectories(ids, frames, time_s, given.xy_m, gsd_m=given.gsd_m, position_sd_m=given.position_sd_m)
-    made = replace(made, seen_s=(float(time_s.min()), float(time_s.max())))  # with those that stand
+    made = replace(made, seen_s=made.window_s)  # with those that stand
     tracks = moving(
         replace(made, measured_length_m=given.sizes_m(made.track_id)[:, 0]) if "length_m" in table else made
     )
