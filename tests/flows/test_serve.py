@@ -303,11 +303,19 @@ class Served:
     url: str
 
     def ask(self, path: str, body: object = None) -> Any:
+        """What the API answers; asked again, as Prefect's client does, while its database is locked (503)."""
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(f"{self.url}/api{path}", data=data)
         request.add_header("Content-Type", "application/json")
-        with urllib.request.urlopen(request, timeout=30) as answer:
-            text = answer.read()
+        for wait_s in (2, 4, 8, 16, None):
+            try:
+                with urllib.request.urlopen(request, timeout=30) as answer:
+                    text = answer.read()
+                break
+            except urllib.error.HTTPError as error:
+                if error.code != 503 or wait_s is None:
+                    raise
+                time.sleep(wait_s)
         return json.loads(text) if text else None
 
     def states(self) -> dict[str, str]:
