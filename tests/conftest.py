@@ -11,7 +11,7 @@ import hypothesis
 import pytest
 
 from flows.launch import prepare_process, spare_proxies
-from schemas.simulation import SimulationConfig
+from schemas.simulation import CameraSimulation, SimulationConfig
 from schemas.summary import RunSummary
 from tests.s3_server import s3_server
 from tests.small_flight import FRAMES, digests, job, process
@@ -82,7 +82,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with made_once(tmp_path_factory, "flight") as (folder, there):
         if not there:
-            write_flight(folder / "flight", SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
+            write_flight(
+                folder / "flight",
+                SimulationConfig(frames=FRAMES, width=640, height=480, camera=CameraSimulation(lens_a=0), seed=11),
+            )
     return folder / "flight"
 
 

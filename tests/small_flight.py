@@ -13,7 +13,7 @@ from velfield.run.layout import RunLayout
 
 SMALL = (
     "detection.fine_tune_steps=6",
-    "lens.refine=never",
+    "lens.calibrate=never",
     "registration.max_keypoints=1200",
     "work.unit_frames=8",
     "work.retries=1",

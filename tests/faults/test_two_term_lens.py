@@ -38,7 +38,7 @@ class LensFlight(NamedTuple):
 def flight(tmp_path_factory: pytest.TempPathFactory) -> LensFlight:
     folder = tmp_path_factory.mktemp("lens")
     write_flight(folder / "flight", two_term_lens(width=WIDTH, height=HEIGHT, frames=FRAMES, seed=SEED))
-    settings = ("lens.refine=auto", "registration.max_keypoints=6000")
+    settings = ("lens.calibrate=auto", "registration.max_keypoints=6000")
     plan = make_plan(job(folder / "flight", folder / "run", *settings))
     write_flight_record(plan)
     compute_stages(plan, stages_before("maps"))
