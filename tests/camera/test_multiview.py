@@ -256,7 +256,7 @@ def test_pairs_are_matched_where_they_see_the_same_and_no_pair_that_tells_nothin
     pictures: tuple[list[np.ndarray], list[np.ndarray]],
 ) -> None:
     frames, views = pictures
-    overlap = match_frame_pairs(frames, pinhole(SMALL))
+    overlap = match_frame_pairs(frames)
     assert overlap is not None
     assert (2, 3) not in {tuple(pair) for pair in overlap.frames.tolist()}
     assert np.bincount(overlap.frames.ravel()).max() <= 6
@@ -266,7 +266,7 @@ def test_pairs_are_matched_where_they_see_the_same_and_no_pair_that_tells_nothin
 
 
 def test_frames_of_different_places_give_no_pairs() -> None:
-    assert match_frame_pairs([city(seed, 240) for seed in (1, 2)], pinhole((240, 240))) is None
+    assert match_frame_pairs([city(seed, 240) for seed in (1, 2)]) is None
 
 
 def test_the_stage_asks_the_control_points_unless_told_not_to(

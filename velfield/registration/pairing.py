@@ -3,6 +3,8 @@
 All pairs of frames are matched. Of those that follow a homography, the pairs are kept that constrain the lens most:
 those that see the same ground at different distances from the image centre. Their matches, found on reduced frames, are
 located again at full size by Lucas-Kanade: a camera that hardly moves shows the lens by hundredths of a pixel.
+The lens need not be known: the threshold of a homography leaves room for its distortion, so the pairs are matched while
+the plumb line is fitted.
 """
 
 from collections.abc import Sequence
@@ -14,7 +16,7 @@ import numpy as np
 from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.frame_pairs import FramePairs
-from velfield.camera.lens import HarrisLens, Lens, pinhole
+from velfield.camera.lens import HarrisLens, pinhole
 from velfield.parallel import parallel_map
 from velfield.registration.keypoints import Keypoints, Pairs, detect_keypoints, match_descriptors
 
@@ -36,24 +38,21 @@ _MAX_CORRECTION_PX = 1.5
 """Largest correction of a match by its alignment, px of the reduced frame."""
 
 
-def match_frame_pairs(frames: Sequence[GreyImage], lens: Lens) -> FramePairs | None:
+def match_frame_pairs(frames: Sequence[GreyImage]) -> FramePairs | None:
     """The most informative frame pairs, each with up to 200 matches; None if no two frames match.
 
     Parameters
     ----------
     frames
         (h, w) uint8, all of one size.
-    lens
-        The lens estimated so far; inliers are matches near a homography of the points it undistorts.
     """
     shape = (frames[0].shape[0], frames[0].shape[1])
     keypoints = parallel_map(_detect, frames)
-    undistorted = [lens.undistort_points(detected.xy) for detected in keypoints]
 
     def match(i: int, j: int, count: int) -> tuple[Pairs, float]:
         """Inlier matches of the first ``count`` keypoints, and their sensitivity to the distortion."""
         matches = match_descriptors(keypoints[i].descriptors[:count], keypoints[j].descriptors[:count])
-        inliers, sensitivity_px = _find_inliers(undistorted[i][matches[:, 0]], undistorted[j][matches[:, 1]], shape)
+        inliers, sensitivity_px = _find_inliers(keypoints[i].xy[matches[:, 0]], keypoints[j].xy[matches[:, 1]], shape)
         return matches[inliers], sensitivity_px
 
     def align(pair: tuple[float, int, int]) -> tuple[int, int, FloatArray, FloatArray] | None:

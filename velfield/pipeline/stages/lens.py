@@ -1,5 +1,7 @@
 """Stage ``lens``: calibration by the plumb line on frames sampled over the flight, refined by frame pairs."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from schemas.arrays import GreyImage, IntArray
@@ -37,9 +39,11 @@ def calibrate_flight(plan: Plan) -> StageResult:
     else:
         frames = select_usable_frames(plan, config.frames)
         images = [store.read(frame) for frame in frames]
-        record = calibrate(images, config)
-        if config.refine == "auto":
-            record = refine_lens(record, match_frame_pairs(images, lens_from_record(record.lens)))
+        with ThreadPoolExecutor(1) as beside:  # the fits keep one processor busy
+            pairs = beside.submit(match_frame_pairs, images) if config.refine == "auto" else None
+            record = calibrate(images, config)
+        if pairs is not None:
+            record = refine_lens(record, pairs.result())
         record = record.model_copy(update={"tilt": _tilt(images[:_TILT_FRAMES], record)})
     write_atomically(plan.layout.camera, record.model_dump_json(indent=1).encode())
     advance("lens")
