@@ -234,6 +234,15 @@ def test_free_flow_and_edie(analysis: TrafficAnalysis) -> None:
     assert product == pytest.approx(slices.flow_veh_per_h[used])
 
 
+@pytest.mark.parametrize("length_m", [18.0, 40.0, 120.0])
+def test_the_mean_speed_of_a_short_lane_is_that_of_its_vehicles(length_m: float) -> None:
+    """A lane ends before the paths that made it do: the time beyond its ends counted, the distance did not."""
+    path = np.array([[0.0, 100.0], [length_m, 100.0]])
+    (flow,) = TrafficAnalysis(gather([drive(path, 6.0 * k) for k in range(30)])).flows
+    assert flow.space_mean_speed_m_per_s is not None
+    assert flow.space_mean_speed_m_per_s.value == pytest.approx(SPEED, rel=0.01)
+
+
 def test_flow_is_of_the_times_that_are_seen() -> None:
     """Two clips of three minutes, half an hour apart: a vehicle every 4 s is 900 an hour."""
     clips = [drive(EAST, begin + 4.0 * k) for begin in (0.0, 1980.0) for k in range(45)]

@@ -19,6 +19,8 @@ LEVEL = 0.9
 _LEAST_EXPOSURE_H = 59 / 3600
 MIN_VEHICLES = 5
 """Fewer vehicles give no estimate."""
+_MAX_SKEW = 0.8
+"""Skewness of a mean times Student's t: by this the longer side of an interval grows by half."""
 _ALIKE_S = 5.0
 """Time between two vehicles in which the correlation of their speeds and delays falls to 1/e."""
 _ALIKE, _ALIKE_PAIRS = 0.7, 15.0
@@ -85,7 +87,8 @@ def estimate_mean(
     min_n: int = MIN_VEHICLES,
     spread: tuple[float, int] = (0.0, 0),
 ) -> Estimate | None:
-    """Mean by Student's t, corrected for skewness (Hall 1992), of independent values unless their times are given.
+    """Mean by Student's t, corrected for skewness (Hall 1992), of independent values unless their times are given. Where
+    no value is below 0 the interval is not either.
 
     Parameters
     ----------
@@ -113,11 +116,13 @@ def estimate_mean(
     scale = float(known.std())
     skewness = float(((known - mean) ** 3).mean()) / scale**3 if scale > 0 else 0.0
     low, high = (mean - _of_skewed(end, skewness / float(np.sqrt(effective))) * error for end in (t, -t))
-    return Estimate(mean, low, high, n)
+    return Estimate(mean, max(low, 0.0) if known.min() >= 0 < mean else low, high, n)
 
 
 def _of_skewed(t: float, skewness: float) -> float:
     """The quantile of Student's statistic of a mean with a skewness, from that of one without (Hall 1992)."""
+    # the expansion holds for small corrections; the skewness of few values is mostly chance
+    skewness = float(np.clip(skewness, -_MAX_SKEW / abs(t), _MAX_SKEW / abs(t)))
     if abs(skewness) < 1e-6:
         return t
     return float(3 / skewness * (np.cbrt(1 + skewness * (t - skewness / 6)) - 1))

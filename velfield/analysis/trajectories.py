@@ -27,6 +27,8 @@ positions differ from that by more than this."""
 _ALIGNED_SD_PX = 0.5
 """A displacement with a larger standard deviation is that of two detections, whose crops did not align."""
 _THREADS = 2
+SAMPLES_M = 1.0
+"""Distance between the samples of a path."""
 _MIN_STEP_M = 0.3
 """Jitter of a stationary vehicle is below it: its path does not grow by it."""
 
@@ -346,7 +348,7 @@ def group_rows(group: IntArray, n: int) -> tuple[IntArray, IntArray]:
     return np.argsort(small, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(group, minlength=n))])
 
 
-def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamples:
+def sample_paths(trajectories: Trajectories, spacing_m: float = SAMPLES_M) -> PathSamples:
     """Points every ``spacing_m`` along each track; a stationary vehicle gives none."""
     first, xy, speed = trajectories.first, trajectories.xy_m, trajectories.speed_m_per_s
     border = np.r_[0, np.cumsum(_count_samples(first, xy, spacing_m, _MIN_STEP_M))].astype(np.int64)

@@ -17,12 +17,13 @@ from velfield.analysis.intervals import (
 )
 from velfield.analysis.lanes.model import LaneSamples
 from velfield.analysis.observed import ObservedSlices
-from velfield.analysis.trajectories import VEHICLE_LENGTH_M
+from velfield.analysis.trajectories import SAMPLES_M, VEHICLE_LENGTH_M
 
 _FOLLOW_S = 3.0
 """A vehicle with a shorter headway follows the one before."""
 _SPREAD, _SPREAD_N = 0.25, 8
 """Speeds on a lane have this coefficient of variation before any is seen; it counts for so many vehicles."""
+_AT_END_M = 1e-6
 _MIN_SLICE_S = 40.0
 """A shorter slice of time is no point of a fundamental diagram."""
 LOS_SIGNAL_S = (10.0, 20.0, 35.0, 55.0, 80.0)
@@ -105,7 +106,7 @@ def lane_flow(
     between = (length + np.r_[length[:1], length[:-1]]) / 2  # the leader's rear half, the follower's front half
     gap = headway[follows] - between[follows] / np.maximum(passing.speed_m_per_s[follows], 1.0)
     enough = len(passing) >= 5
-    driven, spent, at = _by_track(traffic.samples(lane))
+    driven, spent, at = _by_track(traffic.samples(lane), traffic.graph.lanes[lane].length_m)
     return LaneFlow(
         lane,
         estimate_rate(by_slice.slices.sums(passing.time_s), by_slice.slices.hours),
@@ -120,7 +121,7 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
     """Edie's quantities of one lane by slice of the times (k, 2) that are seen."""
     samples, length = traffic.samples(lane), traffic.graph.lanes[lane].length_m
     slices = ObservedSlices.of(observed_s, slice_s)
-    rows, step, wait = _steps(samples)
+    rows, step, wait = _steps(samples, length)
     begin = samples.time_s[rows]
     whole = slices.number(begin) == slices.number(begin + wait)
     driven, spent = (slices.sums(begin[whole], weights[whole]) for weights in (step, wait))
@@ -144,18 +145,21 @@ def _density(density: FloatArray, spent: FloatArray, at: FloatArray) -> Estimate
     return estimate_mean(density, spread=(float(density.mean() * share * np.sqrt(len(density))), 1))
 
 
-def _steps(samples: LaneSamples) -> tuple[IntArray, FloatArray, FloatArray]:
+def _steps(samples: LaneSamples, length_m: float) -> tuple[IntArray, FloatArray, FloatArray]:
     """Rows of the samples from which a track goes on along the lane, how far, m, and how long it takes, s."""
     one = samples.track[1:] == samples.track[:-1]
     step = np.where(one, samples.along_m[1:] - samples.along_m[:-1], 0.0)
     wait = np.where(one, samples.time_s[1:] - samples.time_s[:-1], 0.0)
+    # what lies beyond the lane's ends stands at them: of a step over an end the time on the lane alone counts
+    beyond = (samples.along_m < _AT_END_M) | (samples.along_m > length_m - _AT_END_M)
+    wait = np.where(beyond[1:] | beyond[:-1], wait * np.minimum(step / SAMPLES_M, 1.0), wait)
     rows = np.flatnonzero(one & (step >= 0) & (step < 20.0) & (wait > 0))
     return rows, step[rows], wait[rows]
 
 
-def _by_track(samples: LaneSamples) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _by_track(samples: LaneSamples, length_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(tracks,) distance driven, time spent, and when, of the tracks on a lane, whose samples are by track."""
-    rows, step, wait = _steps(samples)
+    rows, step, wait = _steps(samples, length_m)
     of = np.cumsum(np.diff(samples.track[rows], prepend=samples.track[rows[:1]]) != 0)
     driven, spent, at = (np.bincount(of, w).astype(np.float64) for w in (step, wait, samples.time_s[rows] * wait))
     return driven, spent, at / spent
