@@ -125,7 +125,7 @@ def test_a_drones_telemetry_gives_scale_north_and_place(
     up = float(heading_deg(np.array([-np.pi / 2]), record.north_rad)[0])
     assert any(line.startswith(f"north: the map's top is {compass_text(up)}, standard") for line in done.notes)
     off = np.angle(np.exp(1j * ((north_direction_rad(grid) or 0.0) - np.radians(-90 - config.telemetry.north_deg))))
-    assert abs(np.degrees(off)) < 2.0 + 2.0  # and the zone's own north, off by up to 2 degrees
+    assert abs(np.degrees(off)) < 2.0
     assert run.layout.base_image_tif in done.outputs
 
     done = georeference_run(with_config(plan, gsd_m=0.23 * 1.2))

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rasterio.crs import CRS
 from rasterio.transform import Affine
+from rasterio.warp import transform as to_system
 
 from schemas.arrays import FloatArray
 from schemas.camera import CameraRecord
@@ -153,17 +155,21 @@ def test_what_was_not_made_yet_is_said_with_the_command_that_makes_it(tmp_path: 
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 90.0, 200.0])
-def test_north_in_the_image_is_where_a_step_north_leads(angle_deg: float) -> None:
-    affine = Affine.translation(7e5, 3.5e6) @ Affine.rotation(angle_deg) @ Affine.scale(0.25, -0.25)
+@pytest.mark.parametrize("easting_m", [500_000.0, 700_000.0])
+def test_north_in_the_image_is_where_a_step_along_the_meridian_leads(angle_deg: float, easting_m: float) -> None:
+    """In a UTM zone, on its central meridian and 2.8 degrees east of it."""
+    affine = Affine.translation(easting_m, 5.5e6) @ Affine.rotation(angle_deg) @ Affine.scale(0.25, -0.25)
+    zone = CRS.from_epsg(32637)
     grid = GridRecord(
-        width_px=9, height_px=9, base_source="given", reference_frame=0, crs_wkt="x", affine=tuple(affine)[:6]
+        width_px=9, height_px=9, base_source="given", reference_frame=0, crs_wkt=zone.to_wkt(), affine=tuple(affine)[:6]
     )
     direction = north_direction_rad(grid)
     assert direction is not None
-    a, b, _, d, e, _ = affine[:6]
     step = np.array([np.cos(direction), np.sin(direction)])
-    assert a * step[0] + b * step[1] == pytest.approx(0, abs=1e-9)
-    assert d * step[0] + e * step[1] > 0
+    xs, ys = zip(*(affine @ (4.5 + far * step[0], 4.5 + far * step[1]) for far in (0.0, 4000.0)), strict=True)
+    longitude, latitude = to_system(zone, CRS.from_epsg(4326), xs, ys)
+    assert longitude[0] == pytest.approx(longitude[1], abs=1e-6)
+    assert latitude[1] > latitude[0]
     assert heading_deg(np.array([direction]), direction).tolist() == [0.0]
     assert heading_deg(np.array([direction + np.pi / 2]), direction)[0] == pytest.approx(90)
 

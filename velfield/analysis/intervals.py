@@ -87,8 +87,9 @@ def estimate_mean(
     min_n: int = MIN_VEHICLES,
     spread: tuple[float, int] = (0.0, 0),
 ) -> Estimate | None:
-    """Mean by Student's t, corrected for skewness (Hall 1992), of independent values unless their times are given. Where
-    no value is below 0 the interval is not either.
+    """Mean by Student's t, corrected for skewness (Hall 1992), of independent values unless their times are given.
+
+    Where no value is below 0 the interval is not either.
 
     Parameters
     ----------

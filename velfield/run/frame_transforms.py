@@ -145,13 +145,12 @@ def read_base_image(layout: RunLayout, config: FramesConfig) -> GreyImage:
 
 
 def north_direction_rad(grid: GridRecord) -> float | None:
-    """Direction of north in the image, from +x towards +y (down); None where it is not known."""
-    if grid.affine is None:
+    """Direction of true north in the middle of the image, from +x towards +y (down); None where it is not known."""
+    if grid.crs_wkt is None or grid.affine is None:
         return grid.north_rad
-    a, b, _, d, e, _ = grid.affine
-    # One step north in the CRS, as a step of pixels: the inverse of [[a, b], [d, e]] times (0, 1).
-    determinant = a * e - b * d
-    return float(np.arctan2(a / determinant, -b / determinant))
+    from velfield.sources.geo import true_north_rad  # opening a run loads no rasterio
+
+    return true_north_rad(grid.crs_wkt, grid.affine, (grid.height_px, grid.width_px), name="the base image")
 
 
 def heading_deg(direction_rad: FloatArray, north_rad: float | None) -> FloatArray:
