@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.analysis.test_traffic_analysis import CYCLE_S, EAST, Track, crossroads, drive, gather
+from tests.analysis.test_traffic_analysis import CYCLE_S, EAST, SOUTH, Track, crossroads, drive, gather
 from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.scene import find_scene_gates
 from velfield.analysis.movements.time_slices import slice_edges
@@ -105,6 +105,31 @@ def test_a_road_under_a_tree_is_no_exit() -> None:
     gates, arms = find_scene_gates(analysis.trajectories, analysis.samples, analysis.lanes)
     assert [arm.name for arm in arms] == ["E", "W"]
     assert len(gates) == 2
+
+
+def test_a_stop_line_where_vehicles_wait_at_the_end_or_the_beginning_is_no_place_that_they_go_to() -> None:
+    """A clip of 40 s: red on the way east to its end, on the way south from its beginning to 20 s; all go west."""
+    waits = [drive(EAST, 2.5 * k, stop_at_m=140.0 - 7 * k, go_s=200.0) for k in range(8)]
+    waits += [drive(SOUTH, -40.0 + 2.5 * k, stop_at_m=85.0 - 7 * k, go_s=20.0 + 2 * k) for k in range(6)]
+    waits += [drive(EAST[::-1] - [0.0, 8.0], 2.5 * k) for k in range(8)]
+    tracks = [(times[seen], xy[seen]) for times, xy in waits for seen in [(times >= 0) & (times < 40)]]
+    trajectories = gather(tracks)
+    analysis = TrafficAnalysis(trajectories)
+    _, arms = find_scene_gates(trajectories, analysis.samples, analysis.lanes)
+    assert "inside" not in {arm.name.rstrip("12") for arm in arms}
+
+
+def test_who_leaves_by_a_road_that_hardly_anybody_takes_went_elsewhere(whole: TrafficAnalysis) -> None:
+    """Two vehicles from the west turn north; without them all of 12 would seem to go on as the ten do."""
+    north = np.concatenate([EAST[:1], [[60.0, 100.0], [70.0, 90.0], [70.0, 0.0]]])
+    tracks = [drive(EAST, 5.0 + 8.0 * k) for k in range(10)] + [drive(north, 9.0 + 40.0 * k) for k in range(2)]
+    scene = TrafficAnalysis(gather([drive(SOUTH, 0.0), *tracks])).scene
+    assert scene is not None
+    assert int(scene.trips.elsewhere.sum()) == 2
+    (east,) = [r for r in scene.relations if r.origin.name == "W"]
+    assert east.vehicles == 10
+    assert east.share is not None
+    assert east.share.value == pytest.approx(10 / 12)
 
 
 def test_who_is_still_there_at_the_end_is_told_apart() -> None:

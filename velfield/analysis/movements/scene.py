@@ -33,6 +33,8 @@ _HIDDEN_M = 40.0
 """A place that is hidden from above is no longer."""
 _INSIDE_M = 25.0
 """A gate farther from the scene's border is within it: a yard, or a garage."""
+_EDGE_M = 8.0
+"""A track that ends so near to the edge of the picture, on its way there, is not cut."""
 _CUT_BY_TIME_S = 1.0
 """A track that begins so soon after the first frame, or ends so soon before the last one, is cut by time."""
 _MIN_WHOLE = 3
@@ -55,6 +57,8 @@ class Trips:
         (n, arms) probability of each destination: 1 where the vehicle was seen to leave.
     seen
         From entry to exit, by one track.
+    elsewhere
+        Seen to leave the picture, by no arm: by a road that fewer than three vehicles took.
     remains
         Not seen to leave, but still in the picture at the end; of the others that are not ``seen``, the track is cut.
     """
@@ -65,6 +69,7 @@ class Trips:
     exit_s: FloatArray
     destination: FloatArray
     seen: Mask
+    elsewhere: Mask
     remains: Mask
 
 
@@ -134,7 +139,7 @@ class OriginDestination:
                 continue
             known = rows & np.isfinite(trips.exit_s)
             seen = trips.seen & rows & (trips.destination[:, j] == 1.0)
-            n, entering = int(known.sum()), float(trips.destination[rows].sum())
+            n, entering = int(known.sum()), float(trips.destination[rows].sum() + trips.elsewhere[rows].sum())
             out.append(
                 Relation(
                     self.arms[i],
@@ -227,12 +232,12 @@ def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, gra
     near = within(samples.xy_m, xy - _REACH_M, xy + _REACH_M)
     here = _at_gate(samples.xy_m[near], samples.direction_rad[near], xy, direction, inwards=inwards)
     here = np.unique(samples.track[near[here]])
+    # a vehicle that waits at a stop line when the flight begins or ends neither comes up nor goes there
+    first = trajectories.first[:-1] if inwards else trajectories.first[1:] - 1
+    here = here[~trajectories.is_cut_by_time(trajectories.time_s[first[here]], _CUT_BY_TIME_S, begins=inwards)]
     rows = _terminal(samples, len(trajectories), first=inwards)[here]
-    time = samples.time_s[rows]
-    by_time = trajectories.is_cut_by_time(time, _CUT_BY_TIME_S, begins=inwards)
     ends = _at_gate(samples.xy_m[rows], samples.direction_rad[rows], xy, direction, inwards=inwards)
-    known = ends | ~by_time
-    if ends.sum() < _MIN_WHOLE or ends.sum() < _MIN_FRACTION * known.sum():
+    if ends.sum() < _MIN_WHOLE or ends.sum() < _MIN_FRACTION * len(ends):
         return False
     slow = float(np.median(samples.speed_m_per_s[rows[ends]])) < _YARD_M_PER_S
     # of a side street that ends at the picture's edge between longer ones the hull of the lanes says nothing
@@ -280,20 +285,33 @@ def trace_trips(
     known = (origin >= 0) & (destination >= 0)
     probability = np.zeros((n, len(arms)))
     probability[destination >= 0, destination[destination >= 0]] = 1.0
-    _infer(probability, origin, destination, known, np.flatnonzero(entered & (destination < 0)), graph, vehicles)
-    remains = (destination < 0) & trajectories.is_cut_by_time(ends, _CUT_BY_TIME_S, begins=False)
+    lost = destination < 0
+    elsewhere = lost & _leaves_the_picture(samples, n)
+    _infer(probability, origin, destination, known, np.flatnonzero(entered & lost & ~elsewhere), graph, vehicles)
+    remains = lost & ~elsewhere & trajectories.is_cut_by_time(ends, _CUT_BY_TIME_S, begins=False)
     rows = np.flatnonzero(entered)
     trips = Trips(
         vehicles.track[vehicles.first[rows]],
         origin[rows],
         entry[rows],
-        np.where(destination >= 0, leaves, np.nan)[rows],
+        np.where(lost & ~elsewhere, np.nan, leaves)[rows],
         probability[rows],
-        (destination[rows] >= 0) & (np.diff(vehicles.first)[rows] == 1),
+        ~lost[rows] & (np.diff(vehicles.first)[rows] == 1),
+        elsewhere[rows],
         remains[rows],
     )
     unknown = int(((origin < 0) & ~before).sum())
     return OriginDestination(arms, gates, trips, int(before.sum()), unknown, trajectories.observed_s)
+
+
+def _leaves_the_picture(samples: PathSamples, n: int) -> Mask:
+    """Whether each track (n,) ends at the edge of the picture on its way out."""
+    rows = _terminal(samples, n, first=False)
+    low, high = samples.bounds_m
+    way = np.column_stack([np.cos(samples.direction_rad[rows]), np.sin(samples.direction_rad[rows])])
+    left_m = np.where(way > 0, high - samples.xy_m[rows], samples.xy_m[rows] - low)
+    soon = (np.abs(way) > np.cos(_TURN_RAD)) & (left_m < _EDGE_M)
+    return (samples.track[rows] == np.arange(n)) & soon.any(axis=1)
 
 
 def _terminal_arms(

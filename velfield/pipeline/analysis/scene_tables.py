@@ -44,18 +44,19 @@ def matrix_table(analysis: TrafficAnalysis) -> AnalysisTable:
         return max(entered(arm) - sum(vehicles.get((arm.number, to.number), 0.0) for to in exits), 0.0)
 
     columns += map(column, exits)
-    columns += [Column("unknown", "Not known where", "", unknown, 1), Column("all", "All", "", entered)]
+    columns += [Column("unknown", "By other roads, or not known", "", unknown, 1), Column("all", "All", "", entered)]
     note = _note(scene)
     return make_table(analysis, "origins", "Movements", title, note, columns, entries, lambda arm: arm.xy_m)
 
 
 def _note(scene: OriginDestination) -> str:
     trips = scene.trips
-    seen, remain = int(trips.seen.sum()), int(trips.remains.sum())
-    cut = len(trips.track) - seen - remain
+    seen, remain, elsewhere = (int(of.sum()) for of in (trips.seen, trips.remains, trips.elsewhere))
+    cut = len(trips.track) - seen - remain - elsewhere
+    rare = f"{elsewhere} left by roads that fewer than three took, " if elsewhere else ""
     return (
-        f"{len(trips.track)} vehicles entered the picture: {seen} were seen to leave, {cut} have tracks that are cut, "
-        f"{remain} were still there at the end. Not counted: {scene.before} tracks there at the start, and "
+        f"{len(trips.track)} vehicles entered the picture: {seen} were seen to leave, {rare}{cut} have tracks that are "
+        f"cut, {remain} were still there at the end. Not counted: {scene.before} tracks there at the start, and "
         f"{scene.unknown} that begin inside, most of them the rest of one that was cut."
     )
 
