@@ -69,6 +69,27 @@ def test_what_stands_is_stopped_where_others_drive_along_its_axis(
     assert made.find()["state"].tolist() == ["moving", state]
 
 
+def test_the_head_of_a_queue_that_another_joins_is_stopped() -> None:
+    """Red for all of the clip: nobody drives past the first ones. A row at the kerb beside them is parked."""
+    made = Flight()
+    made.add(1, np.minimum(20 + 1.0 * np.arange(30), 40.0), 50.0)  # comes up, and stops at 40 m
+    for k, x_m in enumerate((47.0, 55.0, 62.0)):
+        made.add(2 + k, standing(x_m, 30), 50.3, 0.05)
+        made.add(12 + k, standing(x_m, 30), 52.6, 0.05)
+    made.add(5, standing(76.0, 30), 50.0)  # beyond a gap
+    made.add(6, standing(33.0, 30), 54.0)  # behind it
+    found = made.find().set_index("track_id")["state"]
+    assert found.loc[[2, 3, 4]].tolist() == ["stopped"] * 3
+    assert found.loc[[5, 6, 12, 13, 14]].tolist() == ["parked"] * 5
+
+
+def test_who_passes_by_makes_no_queue_of_what_is_gone() -> None:
+    made = Flight()
+    made.add(1, np.minimum(20 + 1.0 * np.arange(30), 40.0), 50.0)
+    made.add(2, standing(47.0, 10), 50.0)  # seen until 1.8 s; vehicle 1 stops after 4 s
+    assert made.find()["state"].tolist() == ["moving", "parked"]
+
+
 @pytest.mark.parametrize(
     ("step_m", "frames", "sd_px", "state"),
     [

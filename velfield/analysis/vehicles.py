@@ -1,27 +1,33 @@
 """Vehicles: one row a track, and whether it is part of the traffic.
 
 A detector finds parked cars as well as those that drive. The traffic distinguishes them from a car that waits: where
-vehicles drive along its axis, ahead of it, behind it or over its place at another time, it stands in a lane.
+vehicles drive along its axis, ahead of it, behind it or over its place at another time, it stands in a lane. So it does
+where another came up behind it and stopped: the head of a queue that stands for all of a short clip.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import STATIONARY_SPEED_M_PER_S, assumed_gsd_m
 from velfield.tracking.doubtful import MOVED_M, end_means
 
 STATES = ("moving", "stopped", "parked")
-"""``moving``: at some time; ``stopped``: never, but in a lane that others drive; ``parked``: never, and in none, or no
-vehicle at all."""
+"""``moving``: at some time; ``stopped``: never, but in a lane that others drive or queue in; ``parked``: never, and in
+none, or no vehicle at all."""
 _MOVED_SIGMAS = 4.0
 """A shorter one counts where it is so many standard deviations, at more than a stationary vehicle's speed."""
 _CELL_M, _SECTOR_RAD = 0.5, np.pi / 12
 """Sides of the cells and sectors of axial direction in which driven lanes are noted."""
 _REACH_M, _HALF_WIDTH_M = 8.0, 1.0
 """A lane is looked for so far ahead and behind, and to either side: parked cars stand 2 m and more beside it."""
+_QUEUE_M = (2.5, 10.0)
+"""Least and largest distance between the middles of two vehicles of a queue: two bicycles; a car behind a bus."""
+_QUEUE_RAD = np.radians(20)
+"""Their axes differ by less."""
 _DRIVEN_FRACTION = 0.4
 """Minimum fraction of that length that others drove, for a stationary vehicle to be in a lane."""
 
@@ -67,19 +73,33 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
         cos=("cos", "mean"),
         sin=("sin", "mean"),
         score=("score", "mean"),
+        last_cos=("cos", "last"),
+        last_sin=("sin", "last"),
     ).reset_index()
-    between = (end_means(positions, last=True) - end_means(positions, last=False)).to_numpy(np.float64)
+    ends = end_means(positions, last=True)
+    between = (ends - end_means(positions, last=False)).to_numpy(np.float64)
     displacement_m = np.hypot(between[:, 1], between[:, 2]) * metres
     sd_m = _position_sd_px(tracklets, table["track_id"].to_numpy()) * metres
     speed = displacement_m / np.maximum(between[:, 0], 1e-9)
     surely = (displacement_m > _MOVED_SIGMAS * sd_m) & (speed > STATIONARY_SPEED_M_PER_S)
     moving = (displacement_m > MOVED_M) | surely
-    axis = np.mod(np.arctan2(table["sin"].to_numpy(np.float64), table["cos"].to_numpy(np.float64)) / 2, np.pi)
+    twice = (table[[f"{when}cos", f"{when}sin"]].to_numpy(np.float64) for when in ("", "last_"))
+    axis, last_axis = (np.mod(np.arctan2(two[:, 1], two[:, 0]) / 2, np.pi) for two in twice)
     driven = _DrivenLanes.of(tracklets[np.isin(tracklets["track_id"], table["track_id"][moving])], metres)
-    lane = driven.along(table.loc[~moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres, axis[~moving])
+    standing = _Standing(
+        table.loc[~moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres,
+        axis[~moving],
+        table.loc[~moving, ["first_time_s", "last_time_s"]].to_numpy(np.float64),
+    )
+    queue = standing.ahead_of(
+        ends.loc[moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres,
+        _along(last_axis[moving], between[moving, 1:]),
+        table.loc[moving, "last_time_s"].to_numpy(np.float64),
+    )
+    in_lane = queue | (driven.along(standing.xy_m, standing.axis_rad) >= _DRIVEN_FRACTION)
     state = np.full(len(table), STATES[0], object)
-    state[~moving] = np.where(lane >= _DRIVEN_FRACTION, STATES[1], STATES[2])
-    return table.drop(columns=["cos", "sin"]).assign(
+    state[~moving] = np.where(in_lane, STATES[1], STATES[2])
+    return table.drop(columns=["cos", "sin", "last_cos", "last_sin"]).assign(
         orientation_rad=axis, displacement_m=displacement_m, state=pd.Categorical(state, STATES)
     )
 
@@ -103,6 +123,47 @@ def _position_sd_px(tracklets: pd.DataFrame, ids: IntArray) -> FloatArray:
     """Standard deviation of a displacement within each track: the median of its links'."""
     links = tracklets[["displacement_sd_01_px", "displacement_sd_12_px"]].mean(axis=1)
     return links.groupby(tracklets["track_id"]).median().reindex(ids).to_numpy(np.float64)
+
+
+def _along(axis_rad: FloatArray, way: FloatArray) -> FloatArray:
+    """Unit vectors (n, 2) of axes (n,), of the sense that agrees with ways (n, 2)."""
+    u = np.column_stack([np.cos(axis_rad), np.sin(axis_rad)])
+    return np.asarray(u * np.where((u * way).sum(1) < 0, -1.0, 1.0)[:, None])
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """Vehicles that never move: where (n, 2), how they stand (n,), and when they are first and last seen (n, 2)."""
+
+    xy_m: FloatArray
+    axis_rad: FloatArray
+    seen_s: FloatArray
+
+    def ahead_of(self, xy_m: FloatArray, course: FloatArray, time_s: FloatArray) -> Mask:
+        """Whether each (n,) stands ahead of a vehicle that came up behind it, or of one that does.
+
+        Parameters
+        ----------
+        xy_m, course, time_s
+            (k, 2) where vehicles that moved were last, (k, 2) unit vectors of where they look, and (k,) when.
+        """
+        found = np.zeros(len(self.xy_m), bool)
+        if not len(found):
+            return found
+        tree = cKDTree(self.xy_m)
+        while len(xy_m):
+            near = [tree.query_ball_point(one, _QUEUE_M[1]) for one in xy_m]
+            behind = np.repeat(np.arange(len(xy_m)), [len(rows) for rows in near])
+            ahead = np.array([row for rows in near for row in rows], np.int64)
+            step, u = self.xy_m[ahead] - xy_m[behind], _along(self.axis_rad[ahead], course[behind])
+            along, across = (step * u).sum(1), np.abs(step[:, 0] * u[:, 1] - step[:, 1] * u[:, 0])
+            joined = (along > _QUEUE_M[0]) & (across < _HALF_WIDTH_M) & ~found[ahead]
+            joined &= (u * course[behind]).sum(1) > np.cos(_QUEUE_RAD)
+            joined &= (self.seen_s[ahead, 0] <= time_s[behind]) & (time_s[behind] <= self.seen_s[ahead, 1])
+            ahead, first = np.unique(ahead[joined], return_index=True)
+            found[ahead] = True
+            xy_m, course, time_s = self.xy_m[ahead], u[joined][first], time_s[behind[joined][first]]
+        return found
 
 
 @dataclass(frozen=True)

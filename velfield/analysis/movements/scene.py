@@ -311,7 +311,7 @@ def _leaves_the_picture(samples: PathSamples, n: int) -> Mask:
     way = np.column_stack([np.cos(samples.direction_rad[rows]), np.sin(samples.direction_rad[rows])])
     left_m = np.where(way > 0, high - samples.xy_m[rows], samples.xy_m[rows] - low)
     soon = (np.abs(way) > np.cos(_TURN_RAD)) & (left_m < _EDGE_M)
-    return (samples.track[rows] == np.arange(n)) & soon.any(axis=1)
+    return np.asarray((samples.track[rows] == np.arange(n)) & soon.any(axis=1))
 
 
 def _terminal_arms(
