@@ -33,8 +33,8 @@ def test_an_svg_holds_its_texts_and_asks_for_nothing(whole: tuple[Path, RunSumma
     root = ET.fromstring(text)
     texts = ["".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")]
     vehicles = open_run(whole[0]).vehicles()
-    facts = next(line for line in texts if "vehicles in traffic" in line)
-    assert f"n = {(vehicles['state'] != 'parked').sum()} vehicles in traffic" in facts
+    facts = next(line for line in texts if "vehicles move or wait in a lane" in line)
+    assert f"n = {(vehicles['state'] != 'parked').sum()} vehicles move or wait in a lane" in facts
     assert "2024-05-01 12:00 UTC" in facts
     assert {"Direction of", "travel", "Speed, km/h", "up"} <= set(texts)
     assert sum(bool(re.fullmatch(r"\d+ m", line)) for line in texts) == 2  # a scale bar a map

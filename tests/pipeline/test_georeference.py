@@ -82,6 +82,7 @@ def test_control_points_move_maps_exports_and_lineage(copied: Path, tmp_path: Pa
         assert dataset.crs.to_epsg() == 32633
     with rasterio.open(export_run(run, "cog", tmp_path / "field.tif")) as dataset:
         assert dataset.crs.to_epsg() == 32633
+        np.testing.assert_array_equal(dataset.read(dataset.descriptions.index("count") + 1), run.field.count())
     after = run.field.modal_speed_px_per_s()
     known = np.isfinite(after) & (speed > 5)
     assert np.median(after[known] / speed[known]) == pytest.approx(1.0, abs=0.1)  # vehicles go as fast, in pixels

@@ -27,6 +27,8 @@ positions differ from that by more than this."""
 _ALIGNED_SD_PX = 0.5
 """A displacement with a larger standard deviation is that of two detections, whose crops did not align."""
 _THREADS = 2
+MOVES_M = 6.0
+"""Least extent of a vehicle's path for it to be in the analysis."""
 SAMPLES_M = 1.0
 """Distance between the samples of a path."""
 _MIN_STEP_M = 0.3
@@ -155,7 +157,7 @@ class Trajectories:
         )
 
 
-def moving(trajectories: Trajectories, *, min_extent_m: float = 6.0) -> Trajectories:
+def moving(trajectories: Trajectories, *, min_extent_m: float = MOVES_M) -> Trajectories:
     """The tracks that reach so far: of vehicles that move."""
     if not len(trajectories):
         return trajectories

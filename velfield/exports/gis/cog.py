@@ -20,13 +20,16 @@ AffineCoefficients = tuple[float, float, float, float, float, float]
 
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
-    """All float layers of the field as bands, in SI units where metres are known: see `ExportModule`."""
+    """All layers of the field as bands of float32, in SI units where metres are known: see `ExportModule`."""
     store, grid = open_field(run.layout.field), run.grid
-    names = [name for name in store.layer_names() if store.layer(name).dtype.kind == "f"]
+    names = store.layer_names()
     units = [str(store.group[name].attrs.get("units", "1")) for name in names]
     factors = [grid.gsd_m if grid.gsd_m and unit == "px s-1" else 1.0 for unit in units]
     return cog_bytes(
-        [store.layer(name) * factor for name, factor in zip(names, factors, strict=True)],
+        [
+            np.float32(factor) * store.layer(name).astype(np.float32)
+            for name, factor in zip(names, factors, strict=True)
+        ],
         names=names,
         units=["m s-1" if grid.gsd_m and unit == "px s-1" else unit for unit in units],
         crs_wkt=grid.crs_wkt,

@@ -78,8 +78,8 @@ def _facts(run: Run, options: ExportOptions) -> list[str]:
     states = vehicles["state"]
     count = run.field.count()
     facts = [_date(run, options), f"{seconds:.0f} s of video"]
-    facts += [f"n = {int((states != 'parked').sum())} vehicles in traffic"]
-    facts += [f"{int((states == 'parked').sum())} parked or stationary throughout"]
+    facts += [f"n = {int((states != 'parked').sum())} vehicles move or wait in a lane"]
+    facts += [f"{int((states == 'parked').sum())} stand throughout, parked or no vehicles"]
     if (count > 0).any():
         facts += [f"median of {float(np.median(count[count > 0])):.0f} vehicles at a coloured pixel"]
     return facts

@@ -8,6 +8,7 @@ from velfield.analysis.answers import duration_text, find_answers, longest_queue
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import Queue
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import MOVES_M
 from velfield.errors import count_text
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, compare_delays
 
@@ -87,7 +88,8 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
         ("Where is it dangerous?", events, f"conflicts: {why('conflicts', 'no lane was found')}"),
     )
     n = len(analysis.trajectories)
-    seen = f"{n} vehicle{'s' if n != 1 else ''} that move, in {duration_text(analysis.trajectories.duration_s)}"
+    lasts = duration_text(analysis.trajectories.duration_s)
+    seen = f"{count_text(n, 'vehicle')} that drive{'s' if n == 1 else ''} {MOVES_M:g} m or more, in {lasts}"
     return FirstPage(
         seen,
         tuple(
