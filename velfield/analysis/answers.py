@@ -8,6 +8,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
+from schemas.flight import STATIONARY_SPEED_M_PER_S
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import JunctionSignal, Queue, green_duration_s, queues
@@ -93,7 +94,8 @@ def too_short(analysis: TrafficAnalysis) -> str:
     lacks = "too few" if tracks < _FEW_TRACKS else "too short"
     return (
         f"{count_text(tracks, 'moving vehicle')} in {duration_text(seconds)}, {lacks} for most questions: a "
-        "movement needs 3 vehicles, free flow 8 that go freely, a rate a minute, a signal two cycles"
+        "movement takes 3 vehicles, a free-flow speed 8 that nothing slows down, a flow one minute, "
+        "a signal two whole cycles"
     )
 
 
@@ -189,7 +191,9 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
         yield Answer("speed", lanes_text(long), "too little data", text)
     means = [(flow.lane, mean) for flow in analysis.flows if (mean := flow.space_mean_speed_m_per_s)]
     for lane, mean in sorted(means, key=lambda pair: -pair[1].n):
-        text = f"mean {estimate_text(mean, unit, PER_M_PER_S[unit])}, stops and queues included"
+        slowest = analysis.lane_traffic.samples(lane).speed_m_per_s.min()
+        text = f"mean {estimate_text(mean, unit, PER_M_PER_S[unit])}"
+        text += ", stops and queues included" if slowest < STATIONARY_SPEED_M_PER_S else ""
         yield Answer("mean speed", f"lane {lane}", "found", text, mean.in_units(PER_M_PER_S[unit]), unit)
 
 

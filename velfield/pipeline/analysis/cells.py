@@ -143,5 +143,5 @@ def estimate_cell(estimate: Estimate | None, factor: float = 1.0) -> EstimateRec
     if estimate is None:
         return EstimateRecord()
     scaled = estimate.in_units(factor)
-    value, low, high = (float(f"{number:.4g}") for number in (scaled.value, scaled.low, scaled.high))
+    value, low, high = (round(float(f"{number:.4g}"), 2) for number in (scaled.value, scaled.low, scaled.high))
     return EstimateRecord(value=value, low=low, high=high, n=estimate.n)
