@@ -15,6 +15,7 @@ import pytest
 
 from tests.analysis.test_traffic_analysis import analysis, in_two_clips
 from tests.field_runs import field_run, tracklets_along
+from tests.turning_crossroads import apart_deg, sides, turning_crossroads
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.exports.export import export_run
@@ -117,6 +118,17 @@ def test_utdf_holds_volumes_lanes_and_phases(analysis: TrafficAnalysis) -> None:
     nodes = sections["Nodes"].set_index("INTID")
     assert nodes.loc[number, "TYPE"] == 0
     assert nodes.loc[int(lanes.loc["Up Node", "SBT"]), "Y"] > nodes.loc[number, "Y"]  # y is up
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0])
+def test_utdf_puts_arms_where_their_roads_lead(turned_deg: float) -> None:
+    """From the junction to the gates of the arm N, 7 m away, it is 41 degrees beside the road."""
+    nodes = utdf_sections(utdf(turning_crossroads(turned_deg), height_m=400.0))["Nodes"].set_index("DESCRIPTION")
+    x, y = nodes.loc["junction 0", ["X", "Y"]].astype(float)
+    for arm, road_deg in zip("ESWN", sides(turned_deg), strict=True):
+        end_x, end_y = nodes.loc[f"arm {arm}", ["X", "Y"]].astype(float)
+        assert apart_deg(np.arctan2(y - end_y, end_x - x), road_deg) < 6  # the middle of two lanes may lie beside
+        assert 95 < np.hypot(end_x - x, end_y - y) < 115
 
 
 def test_utdf_ends_greens_where_the_cycle_does_in_a_flight_of_two_clips() -> None:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, IntArray, Mask, RGBImage
 
+TONES = ("#1f3b73", "#c8553d", "#3a8f6b", "#8a6fb0", "#b08a1e", "#5b6770")
+"""Tones of things by their number: dark enough for text, and told apart in greyscale with strokes or marks."""
 _STEPS = 1024
 _WHEEL = np.array(  # lightness, a, b: mean, cosine and sine of the direction, cosine and sine of twice that
     [

@@ -12,6 +12,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray
 from schemas.export import ExportOptions
+from velfield.analysis.movements.gates import Arm
 from velfield.analysis.movements.movements import JunctionMovements, Movement
 from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -28,6 +29,7 @@ _SHARES_LANE = 0.1
 """A lane is of the turns that at least this fraction of its vehicles take."""
 _SIGNAL, _EXTERNAL, _NO_SIGNAL, _ROUNDABOUT = 0, 1, 3, 4
 _PHASES = 8
+_ARM_M = 100.0
 
 Rows = Iterator[list[object]]
 
@@ -111,14 +113,14 @@ class _Node:
         kind = _SIGNAL if self.signal else _ROUNDABOUT if junction.kind == "roundabout" else _NO_SIGNAL
         yield [self.number, kind, *self._place(junction.centre_m), 0, f"junction {junction.number}"]
         for arm in self.found.gates.arms:
-            yield [self.far[arm.name], _EXTERNAL, *self._place(self._end_m(arm.xy_m)), 0, f"arm {arm.name}"]
+            yield [self.far[arm.name], _EXTERNAL, *self._place(_end_m(arm)), 0, f"arm {arm.name}"]
 
     def links(self) -> Rows:
         """The arms as links to the junction, and from it."""
         arms = self.found.gates.arms
         lanes = [sum(g.inwards and g.arm == arm.number for g in self.found.gates.gates) for arm in arms]
         centre = self.found.junction.centre_m
-        length = [round(float(np.hypot(*(self._end_m(arm.xy_m) - centre)))) for arm in arms]
+        length = [round(float(np.hypot(*(_end_m(arm) - centre)))) for arm in arms]
         for name, values in (
             ("Up ID", list(self.far.values())), ("Lanes", lanes), ("Name", [arm.name for arm in arms]),
             ("Distance", length),
@@ -181,11 +183,6 @@ class _Node:
     def _place(self, xy_m: FloatArray) -> tuple[float, float]:
         return round(float(xy_m[0]), 1), round(self.height_m - float(xy_m[1]), 1)
 
-    def _end_m(self, gates_m: FloatArray) -> FloatArray:
-        """Where an arm's external node lies: 100 m beyond its gates."""
-        out = gates_m - self.found.junction.centre_m
-        return np.asarray(gates_m + 100.0 * out / max(float(np.hypot(*out)), 1e-9))
-
     def _lane_counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Lanes of each lane group, and the code of what its lanes share: 1 left, 2 right, 3 both. A shared lane is of
         the group straight on, if there is one."""
@@ -210,6 +207,14 @@ class _Node:
         lane_arm = {g.lane: self.found.gates.arms[g.arm].name for g in self.found.gates.gates if g.inwards}
         phases = self.signal.phases if self.signal else ()
         return {lane_arm[lane]: k for k, lanes in enumerate(phases, start=1) for lane in lanes if lane in lane_arm}
+
+
+def _end_m(arm: Arm) -> FloatArray:
+    """(2,) where an arm's external node lies: ``_ARM_M`` beyond its gates, the way its road leads.
+
+    Gates are only metres from a junction's centre: the direction from there to them is not that of the road.
+    """
+    return np.asarray(arm.xy_m + _ARM_M * np.array([np.cos(arm.outward_rad), np.sin(arm.outward_rad)]))
 
 
 def _assign_bounds(arms: list[str]) -> dict[str, str]:

@@ -11,8 +11,8 @@ from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import count_text
 from velfield.report.drawing import figure_bytes, new_figure
-from velfield.report.traffic.diagrams import draw_turning
 from velfield.report.traffic.report import DPI, STYLE
+from velfield.report.traffic.turning import draw_turning
 
 _UNITS = {"m/s": (3.6, "km/h"), "": (100.0, "%")}
 """Displayed unit and factor, by unit; shares in per cent."""

@@ -16,28 +16,29 @@ from velfield.analysis.movements.movements import MIN_PASSES, JunctionMovements
 from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import count_text
+from velfield.report.colours import TONES
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, lane_names
+from velfield.report.traffic.place import draw_junctions_aside, draw_map, draw_place, place_caption, place_labels
+from velfield.report.traffic.turning import draw_turning, turning_height_in
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_TONES = ("#1f3b73", "#c8553d", "#3a8f6b", "#8a6fb0", "#b08a1e", "#5b6770")
+WIDTH_IN = 7.2
+"""Width of a diagram in the report."""
 _STROKES = ("-", "--", "-.", ":")
 _MARKS = "os^Dvx"
 _RED = "#c62828"
-_PALE_BOX = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
 _MAX_JUNCTIONS = 4
 _SHOWN_S, _SLICE_S = 300.0, 60.0
-_ASIDE_M = 12.0
-_LABEL_AT = (0.33, 0.5, 0.67, 0.2, 0.8, 0.1, 0.9)
-"""Shares of a lane's length before its first junction at which its number may stand: the first that has room."""
-_NUMBERED_M = 12.0
+_LEAST_PART_S = 15.0
+"""A shorter part of a minute shows no flow."""
 _BESIDE_M, _AHEAD_RAD = 2.5, np.radians(45)
 
 
 @dataclass(frozen=True)
 class Diagram:
-    """A picture of the report: ``draw`` fills axes that are ``height_in`` high on a page 7 inches wide; ``bare``: it
+    """A picture of the report: ``draw`` fills axes that are ``height_in`` high on a page `WIDTH_IN` wide; ``bare``: it
     has no labels outside them."""
 
     name: str
@@ -52,20 +53,12 @@ def traffic_diagrams(
     analysis: TrafficAnalysis, picture: GreyImage | None, *, unit: SpeedUnit = "km/h"
 ) -> Iterator[Diagram]:
     """The diagrams that the data allow: the place first, then junctions, signals, speeds, flows and conflicts."""
-    kinds = {analysis.junction_kind(junction.number) for junction in analysis.lanes.junctions}
+    labels = place_labels(analysis, picture)
     yield Diagram(
         "place",
         "The place",
-        "Lanes with their direction of travel and their numbers; J: junctions, small where lanes only merge or part; "
-        f"in red, the roads by which vehicles enter and leave ({analysis.arm_names.legend}). J3 is junction 3, or "
-        "crossing 3, in the text; "
-        "a junction's own arms are named likewise by the side that they lead to."
-        + (
-            " Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn."
-            if "crossing" in kinds
-            else ""
-        ),
-        partial(draw_place, analysis=analysis, picture=picture),
+        place_caption(analysis, labels),
+        partial(draw_place, analysis=analysis, picture=picture, labels=labels),
         4.3,
         bare=True,
     )
@@ -81,7 +74,7 @@ def traffic_diagrams(
             f"ways, if any: fewer than {MIN_PASSES} were seen to go. "
             f"Arms are named by where they lead to ({analysis.arm_names.legend}).",
             partial(draw_turning, found=found),
-            4.6,
+            turning_height_in(found, WIDTH_IN),
             bare=True,
         )
         delays = approach_delays(analysis, found)
@@ -161,144 +154,9 @@ def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements]
             yield Diagram(
                 "flow",
                 f"Junction {found.junction.number}: vehicles that enter, by minute",
-                "By the arm that they enter from, in whole minutes.",
+                _flow_caption(analysis),
                 partial(draw_flow, analysis=analysis, found=found),
             )
-
-
-def _draw_map(axes: "Axes", analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
-    """The base image, pale, with the lanes' centre lines; metres, y down."""
-    gsd = analysis.trajectories.gsd_m
-    if picture is not None:
-        step = max(1, max(picture.shape) // 1600)
-        height, width = picture.shape
-        pale = 255 - (255 - picture[::step, ::step].astype(np.float32)) * 0.55
-        axes.imshow(pale, cmap="gray", vmin=0, vmax=255, extent=(0, width * gsd, height * gsd, 0))
-    for lane in analysis.lanes:
-        axes.plot(*lane.xy_m.T, color="#1b1f24", linewidth=0.9)
-    if picture is None and len(analysis.lanes):
-        axes.invert_yaxis()
-    axes.set_aspect("equal")
-    axes.axis("off")
-
-
-def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
-    """Lanes with arrows and numbers, and the junctions' numbers, over the base image."""
-    _draw_map(axes, analysis, picture)
-    arms = analysis.scene.arms if analysis.scene else ()
-    taken = [junction.centre_m for junction in analysis.lanes.junctions] + [arm.xy_m for arm in arms]
-    apart_m = float(np.abs(np.diff(axes.get_xlim()))[0]) / 28
-    reach_m = {lane.number: lane.length_m for lane in analysis.lanes}
-    for gate in (gate for found in analysis.movements for gate in found.gates.gates if gate.inwards):
-        lane = analysis.lanes.lanes[gate.lane]
-        at_m = float(lane.along_m[np.argmin(np.hypot(*(lane.xy_m - gate.xy_m).T))])
-        reach_m[gate.lane] = min(reach_m[gate.lane], max(at_m, _NUMBERED_M))
-    for lane in sorted(analysis.lanes, key=lambda lane: lane.length_m):
-        if lane.length_m >= _NUMBERED_M:
-            at = lane.at(lane.length_m / 2), lane.at(lane.length_m / 2 + 3)
-            style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 11}
-            axes.annotate("", xy=(at[1][0], at[1][1]), xytext=(at[0][0], at[0][1]), arrowprops=style)
-            places = [lane.at(share * reach_m[lane.number]) for share in _LABEL_AT]
-            free = [min((float(np.hypot(*(place - one))) for one in taken), default=np.inf) for place in places]
-            best = int(np.argmax(np.minimum(free, apart_m)))
-            taken.append(places[best])
-            x, y = places[best]
-            axes.text(x, y, str(lane.number), ha="center", va="center", fontsize=6.5, color="#0b4f8a", bbox=_PALE_BOX)
-    _draw_junctions(axes, analysis)
-    for arm in arms:
-        x, y = arm.xy_m
-        axes.text(x, y, arm.name, ha="center", va="center", fontsize=8, color="#7a1f1f", fontweight="bold",
-                  bbox=_PALE_BOX)  # fmt: skip
-    _draw_scale(axes)
-    _draw_north(axes, analysis.arm_names.north_rad)
-
-
-def _draw_junctions(axes: "Axes", analysis: TrafficAnalysis, *, aside_m: float = 0.0) -> None:
-    """Numbers of the junctions, small where lanes only merge or part, with a line to them from beside what is there."""
-    for junction in analysis.lanes.junctions:
-        kind = analysis.junction_kind(junction.number)
-        box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
-        box["linestyle"] = "--" if kind == "crossing" else "-"
-        size = 6.5 if kind in ("merge", "diverge") else 11
-        x, y = junction.centre_m + aside_m
-        if aside_m:
-            axes.plot(*np.array([junction.centre_m, (x, y)]).T, color="#1b1f24", linewidth=0.8)
-        axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=size, fontweight="bold", bbox=box)
-
-
-def _draw_scale(axes: "Axes") -> None:
-    """A bar of a round number of metres in the lower left corner, about a fifth as long as the picture is wide."""
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    if not right - left > 0:
-        return
-    longest = (right - left) / 5
-    power = 10.0 ** np.floor(np.log10(longest))
-    length = power * max(step for step in (1, 2, 5) if step * power <= longest)
-    x, y = left + 0.03 * (right - left), bottom + 0.04 * (top - bottom)
-    axes.plot([x, x + length], [y, y], color="#1b1f24", linewidth=3, solid_capstyle="butt")
-    above = y + 0.02 * (top - bottom)
-    axes.text(x + length / 2, above, f"{length:g} m", ha="center", va="bottom", fontsize=7, bbox=_PALE_BOX)
-
-
-def _draw_north(axes: "Axes", north_rad: float | None) -> None:
-    """An arrow to the north in the upper right corner, where north is known."""
-    if north_rad is None:
-        return
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    size = 0.05 * (right - left)
-    at = np.array([right - 1.5 * size, top + np.sign(bottom - top) * 1.5 * size])
-    tip = at + size * np.array([np.cos(north_rad), np.sin(north_rad)])
-    style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 14}
-    axes.annotate("N", xy=(tip[0], tip[1]), xytext=(at[0], at[1]), ha="center", va="center", fontsize=8,
-                  arrowprops=style, bbox=_PALE_BOX)  # fmt: skip
-
-
-def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
-    """The turning-movement diagram of a junction."""
-    arms = {arm.name: arm for arm in found.gates.arms}
-    angle = {name: np.arctan2(*(arm.xy_m - found.junction.centre_m)[::-1]) for name, arm in arms.items()}
-    most = max(m.seen + m.inferred for m in found.movements)
-    for k, name in enumerate(arms):
-        outward = np.array([np.cos(angle[name]), np.sin(angle[name])])
-        aside = np.array([-outward[1], outward[0]])
-        mine = sorted((m for m in found.movements if m.arm_in == name), key=lambda m: -(m.seen + m.inferred))
-        for rank, m in enumerate(mine):
-            out = np.array([np.cos(angle[m.arm_out]), np.sin(angle[m.arm_out])])
-            out_aside = np.array([-out[1], out[0]])
-            lane = 0.1 + 0.09 * rank
-            start, end = outward - aside * lane, out * 0.97 + out_aside * (0.1 + 0.06 * k)
-            line = _bezier(start, 0.25 * (outward - aside * lane), 0.25 * (out + out_aside * 0.1), end)
-            width = 1.2 + 11 * (m.seen + m.inferred) / most
-            tone = _TONES[k % len(_TONES)]
-            axes.plot(*line[:-4].T, color=tone, linewidth=width, alpha=0.8, solid_capstyle="butt")
-            style = {"arrowstyle": "-|>", "color": tone, "mutation_scale": 9 + 1.4 * width, "linewidth": 0}
-            axes.annotate("", xy=(line[-1, 0], line[-1, 1]), xytext=(line[-8, 0], line[-8, 1]), arrowprops=style)
-        lines = [
-            f"to {m.arm_out}: {m.seen + m.inferred:.0f}" + (f" ({100 * m.share.value:.0f} %)" if m.share else "")
-            for m in mine
-        ]
-        counted = sum(m.seen + m.inferred for m in mine)
-        total = max([counted, *((m.seen + m.inferred) / m.share.value for m in mine if m.share)])
-        lines += [f"by rare ways: {total - counted:.0f}"] if total - counted >= 0.5 else []
-        lines = [f"from {name}: {total:.0f}", *lines] if mine else [f"{name}: no turns known from there"]
-        side = "left" if outward[0] > 0.3 else "right" if outward[0] < -0.3 else "center"
-        up = "top" if outward[1] > 0.7 else "bottom" if outward[1] < -0.7 else "center"
-        axes.text(
-            1.12 * outward[0],
-            1.12 * outward[1],
-            "\n".join(lines),
-            ha=side,
-            va=up,
-            fontsize=9,
-            color=_TONES[k % len(_TONES)],
-        )
-    axes.set(xlim=(-2.2, 2.2), ylim=(1.5, -1.5), aspect="equal")
-    axes.axis("off")
-
-
-def _bezier(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-    t = np.linspace(0, 1, 60)[:, None]
-    return np.asarray((1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d)
 
 
 def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
@@ -381,10 +239,10 @@ def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[Stream
     of = [names.get(s.stream.approach.lane, f"lane {s.stream.approach.lane}") for s in streams]
     arms = [name.split(",")[0] for name in of]
     order = sorted(range(len(streams)), key=lambda k: arms[:k].count(arms[k]))  # each approach before second lanes
-    for k, chosen in enumerate(order[: len(_TONES)]):
+    for k, chosen in enumerate(order[: len(TONES)]):
         stream = streams[chosen]
         counts = [q.vehicles.value for q in queues(stream.stream, times)]
-        axes.step(times, counts, where="post", color=_TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
+        axes.step(times, counts, where="post", color=TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
                   label=of[chosen].removeprefix("from "))  # fmt: skip
     axes.set(xlabel="time, s", ylabel="standing vehicles", ylim=(0, None), xlim=(begin, end))
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -421,7 +279,7 @@ def draw_fundamental(axes: "Axes", *, points: FloatArray, per_m_per_s: float, un
     shown = lanes[np.argsort(-np.bincount(of, points[:, 2]), kind="stable")][: len(_MARKS)]  # with the most vehicles
     for k, lane in enumerate(shown):
         mine = points[points[:, 0] == lane]
-        axes.plot(mine[:, 1], mine[:, 2], _MARKS[k], color=_TONES[k], markersize=5, alpha=0.8, label=f"lane {lane:.0f}")
+        axes.plot(mine[:, 1], mine[:, 2], _MARKS[k], color=TONES[k], markersize=5, alpha=0.8, label=f"lane {lane:.0f}")
     speed = float(np.quantile(points[:, 3], 0.85))
     right = float(points[:, 1].max())
     top = float(points[:, 2].max()) * 1.15
@@ -434,33 +292,42 @@ def draw_fundamental(axes: "Axes", *, points: FloatArray, per_m_per_s: float, un
 
 
 def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovements) -> None:
-    """Vehicles that enter a junction in each minute, by arm."""
+    """Vehicles that enter a junction in each minute, by arm; in a part of one, as many as a whole one would have."""
     begin, end = analysis.window_s
-    edges = np.arange(begin, end + 1e-9, _SLICE_S)
+    edges = np.append(np.arange(begin, end - 1e-9, _SLICE_S), end)
     seen = analysis.trajectories.observed_within(edges)
     passes, gates = found.passes, found.gates
     arm = np.array([gate.arm for gate in gates.gates] + [-1])[passes.gate_in]
     for k, one in enumerate(gates.arms):
         counts = np.histogram(passes.entry_s[(arm == one.number) & np.isfinite(passes.entry_s)], edges)[0]
         if counts.any():
-            minutes = np.where(seen > _SLICE_S / 4, counts * _SLICE_S / np.maximum(seen, 1e-9), np.nan)
+            minutes = np.where(seen >= _LEAST_PART_S, counts * _SLICE_S / np.maximum(seen, 1e-9), np.nan)
             minutes = np.append(minutes, minutes[-1])
-            axes.step(edges / 60, minutes, where="post", color=_TONES[k % 6], linestyle=_STROKES[k % 4],
+            axes.step(edges / 60, minutes, where="post", color=TONES[k % 6], linestyle=_STROKES[k % 4],
                       linewidth=1.6, label=f"from {one.name}")  # fmt: skip
-    axes.set(xlabel="time, min", ylabel="vehicles a minute", ylim=(0, None))
+    axes.set(xlabel="time, min", ylabel="vehicles a minute", xlim=(begin / 60, end / 60), ylim=(0, None))
     _legend_above(axes, 6)
+
+
+def _flow_caption(analysis: TrafficAnalysis) -> str:
+    begin, end = analysis.window_s
+    part = (end - begin) % _SLICE_S
+    out = "By the arm that they enter from, in whole minutes."
+    if part >= _LEAST_PART_S:
+        return f"{out} The last {part:.0f} s are a part of one: their vehicles count as so many a minute."
+    return f"{out} The last {part:.0f} s are too short a part of one, and left out." if part >= 0.5 else out
 
 
 def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
     """Conflicts by kind, and U-turns, on the map."""
-    _draw_map(axes, analysis, picture)
-    _draw_junctions(axes, analysis, aside_m=_ASIDE_M)
+    draw_map(axes, analysis, picture)
+    draw_junctions_aside(axes, analysis)
     likely = [c for c in analysis.conflicts if c.likely]
     kinds = sorted({c.kind for c in likely})
     places: dict[str, list[FloatArray]] = {kind: [c.xy_m for c in likely if c.kind == kind] for kind in kinds}
     places["U-turn"] = [reversal.xy_m for reversal in analysis.reversals]
     for (kind, at), mark in zip(places.items(), _MARKS, strict=False):
-        tone = _RED if kind != "U-turn" else _TONES[0]
+        tone = _RED if kind != "U-turn" else TONES[0]
         if at:
             axes.plot(*np.array(at).T, mark, color=tone, markeredgecolor="white", markersize=8,
                       label=f"{kind}: {len(at)}")  # fmt: skip

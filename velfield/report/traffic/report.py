@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from schemas.analysis import AnalysisRecord, AnalysisTable, Cell, EstimateRecord
 from schemas.flight import PAPER_GSD_M
 from velfield.report.drawing import figure_bytes, new_figure, pages_bytes
-from velfield.report.traffic.diagrams import Diagram
+from velfield.report.traffic.diagrams import WIDTH_IN, Diagram
 from velfield.report.traffic.first_page import FirstPage
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 400
 """Rows of a table that are shown; the workbook and the JSON have all."""
-_WIDTH_IN, _PAGE_IN = 7.2, (8.27, 11.69)
+_PAGE_IN = (8.27, 11.69)
 DPI = 130
 _TOP_IN, _FOOT_IN = 11.0, 0.4
 _WRAP, _LINE_IN = 118, 0.16
@@ -78,7 +78,7 @@ def _seen(record: AnalysisRecord, page: FirstPage) -> str:
 
 
 def _picture(diagram: Diagram) -> str:
-    figure = new_figure(_WIDTH_IN, diagram.height_in, dpi=DPI)
+    figure = new_figure(WIDTH_IN, diagram.height_in, dpi=DPI)
     diagram.draw(figure.add_subplot())
     figure.tight_layout()
     url = f"data:image/png;base64,{b64encode(figure_bytes(figure, 'png')).decode()}"
