@@ -18,8 +18,12 @@ from schemas.tables import DIMENSION_COLUMNS
 from tests.analysis.test_lanes import AVENUE, BESIDE, GSD_M, LEAVES, OPPOSITE, driven
 from tests.exports.test_exports import UTM
 from tests.field_runs import field_run, tracklets_along
+from tests.pipeline.test_given_tracks import process
+from tests.turning_crossroads import EASTWARDS, NORTHWARDS, RIGHT, write_tracks
+from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples
 from velfield.exports.export import export_run
-from velfield.exports.roads.network import RoadNetwork, road_network
+from velfield.exports.roads.network import RoadLane, RoadNetwork, road_network
+from velfield.exports.roads.parts import cut_at_intersections
 from velfield.run.run import Run, open_run
 from velfield.run.tables import write_table
 
@@ -187,3 +191,104 @@ def test_a_table_with_a_reference_system_has_coordinates(run: Run) -> None:
     table = trajectory_table(placed)
     assert table["latitude_deg"].between(31, 32).all()
     assert table["longitude_deg"].between(35, 36).all()
+
+
+@pytest.fixture(scope="module")
+def crossroads_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    root = tmp_path_factory.mktemp("crossroads")
+    write_tracks(root / "tracks.csv")
+    return process(root / "tracks.csv", root / "run", position_y_axis="down")
+
+
+def by_way(network: RoadNetwork) -> dict[str, RoadLane]:
+    """The lanes by the way that they lead, from the crossroads or to them."""
+    out = {}
+    for lane in network.lanes:
+        x, y = lane.xy_m[-1] - lane.xy_m[0]
+        way = "N" if y > abs(x) else "E" if x > abs(y) else "S"
+        out[("from " if lane.begins_at is not None else "to ") + way] = lane
+    return out
+
+
+def test_traffic_that_goes_straight_on_meets_at_a_node_and_is_counted(crossroads_run: Run, tmp_path: Path) -> None:
+    network = road_network(crossroads_run)
+    assert len(network.lanes) == 5
+    lanes = by_way(network)
+    assert set(lanes) == {"to N", "from N", "to E", "from E", "from S"}
+    unpack(crossroads_run, tmp_path)
+    edges = {edge.get("id"): edge for edge in ET.parse(tmp_path / "velfield.edg.xml").getroot()}
+    assert len({edges[lanes[f"to {way}"].name].get("to") for way in "NE"}) == 1
+    assert len({edges[lanes[one].name].get("to" if one.startswith("to") else "from") for one in lanes}) == 1
+    turns = {
+        (turn.get("from"), turn.get("to")): int(turn.get("count", ""))
+        for turn in ET.parse(tmp_path / "velfield.turns.xml").getroot().iter("edgeRelation")
+    }
+    assert turns == {
+        (lanes["to N"].name, lanes["from N"].name): NORTHWARDS,
+        (lanes["to E"].name, lanes["from E"].name): EASTWARDS,
+        (lanes["to E"].name, lanes["from S"].name): RIGHT,
+    }
+
+
+def test_the_speed_of_an_edge_is_the_distance_driven_over_the_time_spent(crossroads_run: Run) -> None:
+    """Stops are in it, as in SUMO's own results; the mean of the speeds along the lane is higher."""
+    tracks, height_m = crossroads_run.analysis.trajectories, crossroads_run.grid.height_px * crossroads_run.gsd_m
+    for lane in road_network(crossroads_run).lanes:
+        axis = int(abs(np.ptp(lane.xy_m[:, 1])) > abs(np.ptp(lane.xy_m[:, 0])))
+        begin, end = lane.xy_m[0, axis], lane.xy_m[-1, axis]
+        spent = []
+        for rows in tracks:
+            xy, time = tracks.xy_m[rows] * [1, -1] + [0, height_m], tracks.time_s[rows]
+            beside = np.abs(np.interp(xy[:, axis], *sorted_line(lane, axis)) - xy[:, 1 - axis]) < 2
+            s = (xy[beside, axis] - begin) / (end - begin)
+            if beside.any() and s.min() < 0.05 and s.max() > 0.95:
+                spent.append(np.ptp(np.interp([0.05, 0.95], np.maximum.accumulate(s), time[beside])))
+        assert lane.speed_m_per_s == pytest.approx(0.9 * abs(end - begin) / np.mean(spent), rel=0.08)
+        assert lane.vehicles == pytest.approx(len(spent), abs=1)
+
+
+def sorted_line(lane: RoadLane, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(lane.xy_m[:, axis])
+    return lane.xy_m[order, axis], lane.xy_m[order, 1 - axis]
+
+
+def test_sumo_knows_that_ways_cross_and_drives_all_vehicles(crossroads_run: Run, tmp_path: Path) -> None:
+    netconvert, sumo = sumo_tool("netconvert"), sumo_tool("sumo")
+    unpack(crossroads_run, tmp_path)
+    subprocess.run([netconvert, "-c", "velfield.netccfg"], cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    requests = ET.parse(tmp_path / "velfield.net.xml").getroot().findall("junction/request")
+    assert sorted(one.get("foes") for one in requests) == ["001", "001", "110"]  # one way crosses two others
+    command = [sumo, "-c", "velfield.sumocfg", "--tripinfo-output", "trips.xml", "--no-step-log"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    assert len(ET.parse(tmp_path / "trips.xml").getroot().findall("tripinfo")) == NORTHWARDS + EASTWARDS + RIGHT
+    path = export_run(crossroads_run, "opendrive", tmp_path / "x.xodr")
+    command = [netconvert, "--opendrive-files", str(path), "-o", str(tmp_path / "x.net.xml")]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+
+
+def test_lanes_are_cut_at_intersections_and_those_within_have_no_part() -> None:
+    """Lane 0 runs through two squares, lane 1 ends in the first, lane 2 lies in it, lane 3 leads out of it."""
+    square = np.array([[-5.0, -5.0], [5.0, -5.0], [5.0, 5.0], [-5.0, 5.0]])
+    lines = [
+        np.column_stack([np.arange(-40.0, 101, 2), np.zeros(71)]),
+        np.column_stack([np.zeros(21), np.arange(-40.0, 1, 2)]),
+        np.array([[0.0, 0.0], [1.0, 1.0]]),
+        np.column_stack([np.ones(20), np.arange(1.0, 41, 2)]),
+    ]
+    lanes = tuple(Lane(k, line, 4, 3.0, "spread") for k, line in enumerate(lines))
+    rows = [(t, 0, s) for t in range(4) for s in range(140)]
+    for t in range(4, 8):
+        rows += [(t, 1, s) for s in range(40)] + [(t, 2, 0.5)] + [(t, 3, s) for s in range(38)]
+    track, lane, along = np.array(rows, float).T
+    zero = np.zeros(len(track))
+    samples = LaneSamples(track.astype(np.int64), lane.astype(np.int64), along, zero, along, zero + 1)
+    links = (Connection(1, 2, 4, 1.0, "straight"), Connection(2, 3, 4, 1.0, "straight"))
+    parts = cut_at_intersections(LaneGraph(lanes, links, (), samples), [square, square + np.array([60.0, 0.0])])
+    assert parts.names == ("lane0#0", "lane0#1", "lane0#2", "lane1", "lane3")
+    assert parts.ends == ((None, 0), (0, 1), (1, None), (None, 0), (0, None))
+    assert parts.connections == ((0, 1), (1, 2), (3, 4))
+    assert [part.tracks for part in parts.graph] == [4] * 5
+    assert parts.graph.samples.along_m.max() <= max(part.length_m for part in parts.graph)
+    whole = cut_at_intersections(LaneGraph(lanes, links, (), samples), [])
+    assert whole.names == ("lane0", "lane1", "lane2", "lane3")
+    assert whole.connections == ((1, 2), (2, 3))

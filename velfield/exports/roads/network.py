@@ -6,31 +6,38 @@ from itertools import pairwise
 import numpy as np
 
 from schemas.arrays import FloatArray
+from velfield.analysis.flow.passings import LaneTraffic
+from velfield.analysis.flow.volume import lane_flow
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
+from velfield.exports.roads.parts import cut_at_intersections
 from velfield.run.run import Run
 
 
 @dataclass(frozen=True)
 class RoadLane:
-    """A lane.
+    """A lane, or a part of one between intersections.
 
     Attributes
     ----------
-    number : of the lane.
+    number, name : number in the network; ``lane2``, or ``lane2#0``, ``lane2#1`` of lane 2 in several parts.
     xy_m : (n, 2) centre line in the direction of travel, x to the right of the map, y upwards.
     width_m : of the lane.
-    speed_m_per_s : mean of the vehicles on it, time-mean.
-    high_speed_m_per_s : their 85th percentile.
+    speed_m_per_s : space-mean speed of the vehicles on it; None where too few were seen.
+    high_speed_m_per_s : 85th percentile of the speeds along the whole lane.
     vehicles : number of tracks on it.
+    begins_at, ends_at : numbers of the intersections at which it begins and ends; None: at none.
     """
 
     number: int
+    name: str
     xy_m: FloatArray
     width_m: float
-    speed_m_per_s: float
+    speed_m_per_s: float | None
     high_speed_m_per_s: float
     vehicles: int
+    begins_at: int | None = None
+    ends_at: int | None = None
 
 
 @dataclass(frozen=True)
@@ -45,7 +52,7 @@ class Trip:
 
 @dataclass(frozen=True)
 class RoadNetwork:
-    """Lanes, connections (from, to), trips in order of time, and the time from the first position to the last, s."""
+    """Lanes, connections (from, to), trips in order of time, and the time that is seen, s."""
 
     lanes: tuple[RoadLane, ...]
     connections: tuple[tuple[int, int], ...]
@@ -62,25 +69,30 @@ def road_network(run: Run) -> RoadNetwork:
         The ground sample distance is not known, or no lanes were found.
     """
     gsd_m = run.gsd_m
-    graph, trajectories = run.analysis.lanes(), run.analysis.trajectories
+    traffic, trajectories = run.analysis.traffic, run.analysis.trajectories
+    graph = traffic.lanes
     if not len(graph):
         raise InputError("no lanes were found in the tracks of this run; a longer flight shows more traffic")
-    samples, georeference = graph.samples, Georeference.from_grid(run.grid)
-    lanes = []
-    for lane in graph:
-        speeds = samples.speed_m_per_s[samples.lane == lane.number]
-        speeds = speeds if len(speeds) else np.array([13.9])
+    meet = [j.hull_m for j in graph.junctions if traffic.junction_kind(j.number) == "intersection"]
+    parts, georeference = cut_at_intersections(graph, meet), Georeference.from_grid(run.grid)
+    on_parts, lanes = LaneTraffic(parts.graph), []
+    for lane, of, name, (begins_at, ends_at) in zip(parts.graph, parts.lanes, parts.names, parts.ends, strict=True):
+        mean = lane_flow(on_parts, lane.number, trajectories.observed_s).space_mean_speed_m_per_s
+        high = np.percentile(graph.samples.speed_m_per_s[graph.samples.lane == of], 85)
         lanes.append(
             RoadLane(
                 number=lane.number,
+                name=name,
                 xy_m=georeference.to_metres(lane.xy_m / gsd_m),
                 width_m=float(np.clip(lane.width_m, 2.0, 6.0)),
-                speed_m_per_s=float(speeds.mean()),
-                high_speed_m_per_s=float(max(np.percentile(speeds, 85), 1.0)),
+                speed_m_per_s=mean.value if mean else None,
+                high_speed_m_per_s=float(max(high, 1.0)),
                 vehicles=lane.tracks,
+                begins_at=begins_at,
+                ends_at=ends_at,
             )
         )
-    connections = tuple((one.start, one.end) for one in graph.connections)
+    samples, connections = parts.graph.samples, parts.connections
     first_s = float(trajectories.time_s.min()) if len(trajectories.time_s) else 0.0
     trips = _trips(samples.track, samples.lane, samples.time_s - first_s, samples.speed_m_per_s, set(connections))
     named = tuple(replace(trip, track_id=int(trajectories.track_id[trip.track_id])) for trip in trips)

@@ -17,6 +17,8 @@ _CUT_M = 1.0
 """A lane is cut so much short where it is connected: connecting roads have a length."""
 _CONNECTING = 100_000
 """Connecting roads are numbered from here."""
+_CURVE_M, _PIECES = 4.0, 8
+"""A longer connecting road is a curve of so many straight pieces."""
 
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
@@ -40,7 +42,7 @@ def opendrive_xml(network: RoadNetwork, georeference: Georeference) -> bytes:
         ET.SubElement(header, "userData", code="bearing_of_y_deg", value=f"{bearing_deg:.3f}")
     nodes, lines = lane_nodes(network), {lane.number: _left_border(lane, network) for lane in network.lanes}
     for lane in network.lanes:
-        road = _road(root, lane.number, lines[lane.number], lane.width_m, lane.high_speed_m_per_s)
+        road = _road(root, lane.number, lane.name, lines[lane.number], lane.width_m, lane.high_speed_m_per_s)
         link = ET.Element("link")
         if any(end == lane.number for _, end in network.connections):
             junction = str(nodes[lane.number, "start"] + 1)
@@ -56,14 +58,13 @@ def opendrive_xml(network: RoadNetwork, georeference: Georeference) -> bytes:
 def _junctions(
     root: ET.Element, network: RoadNetwork, nodes: dict[tuple[int, str], int], lines: dict[int, Points]
 ) -> None:
-    widths = {lane.number: lane for lane in network.lanes}
+    lanes = {lane.number: lane for lane in network.lanes}
     junctions: dict[int, ET.Element] = {}
     for k, (start, end) in enumerate(network.connections):
         number = nodes[start, "end"] + 1
-        line = np.stack([lines[start][-1], lines[end][0]])
-        road = _road(
-            root, _CONNECTING + k, line, widths[start].width_m, widths[start].high_speed_m_per_s, junction=number
-        )
+        name, before = f"{lanes[start].name} to {lanes[end].name}", lanes[start]
+        line = _connecting_line(lines[start], lines[end])
+        road = _road(root, _CONNECTING + k, name, line, before.width_m, before.high_speed_m_per_s, junction=number)
         link = ET.Element("link")
         ET.SubElement(link, "predecessor", elementType="road", elementId=str(start), contactPoint="end")
         ET.SubElement(link, "successor", elementType="road", elementId=str(end), contactPoint="start")
@@ -101,13 +102,25 @@ def _left_border(lane: RoadLane, network: RoadNetwork) -> Points:
     return np.asarray(line + 0.5 * lane.width_m * np.column_stack([-direction[:, 1], direction[:, 0]]))
 
 
+def _connecting_line(before: Points, after: Points) -> Points:
+    """(n, 2) from the end of one line to the start of another: across an intersection a curve along both."""
+    a, b = before[-1], after[0]
+    length = float(np.hypot(*(b - a)))
+    if length < _CURVE_M:
+        return np.stack([a, b])
+    ways = before[-1] - before[-2], after[1] - after[0]
+    u, v = (way / max(float(np.hypot(*way)), 1e-9) * length / 3 for way in ways)
+    t = np.linspace(0, 1, _PIECES + 1)[:, None]
+    return np.asarray((1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * (a + u) + 3 * (1 - t) * t**2 * (b - v) + t**3 * b)
+
+
 def _road(
-    root: ET.Element, number: int, line: Points, width_m: float, speed_m_per_s: float, *, junction: int = -1
+    root: ET.Element, number: int, name: str, line: Points, width_m: float, speed_m_per_s: float, *, junction: int = -1
 ) -> ET.Element:
     step = np.diff(line, axis=0)
     lengths: FloatArray = np.maximum(np.hypot(*step.T), 1e-3)
     total = f"{lengths.sum():.4f}"
-    road = ET.SubElement(root, "road", id=str(number), name=f"lane{number}", length=total, junction=str(junction))
+    road = ET.SubElement(root, "road", id=str(number), name=name, length=total, junction=str(junction))
     kind = ET.SubElement(road, "type", s="0", type="town")
     ET.SubElement(kind, "speed", max=f"{speed_m_per_s:.2f}", unit="m/s")
     plan = ET.SubElement(road, "planView")

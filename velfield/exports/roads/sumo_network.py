@@ -74,7 +74,7 @@ def sumo_archive(network: RoadNetwork) -> bytes:
 
 
 def lane_nodes(network: RoadNetwork) -> dict[tuple[int, str], int]:
-    """The node of each lane's ``start`` and ``end``: ends that are connected share one."""
+    """The node of each lane's ``start`` and ``end``: ends at one intersection, or that are connected, share one."""
     parent = {(lane.number, end): (lane.number, end) for lane in network.lanes for end in ("start", "end")}
 
     def root(one: tuple[int, str]) -> tuple[int, str]:
@@ -84,6 +84,11 @@ def lane_nodes(network: RoadNetwork) -> dict[tuple[int, str], int]:
 
     for before, after in network.connections:
         parent[root((after, "start"))] = root((before, "end"))
+    at: dict[int, tuple[int, str]] = {}
+    for lane in network.lanes:
+        for junction, end in ((lane.begins_at, "start"), (lane.ends_at, "end")):
+            if junction is not None:
+                parent[root((lane.number, end))] = root(at.setdefault(junction, (lane.number, end)))
     numbers = {one: k for k, one in enumerate(sorted({root(one) for one in parent}))}
     return {one: numbers[root(one)] for one in parent}
 
@@ -104,23 +109,25 @@ def _edges_xml(network: RoadNetwork) -> str:
         shape = " ".join(f"{x:.2f},{y:.2f}" for x, y in lane.xy_m)
         ends = nodes[lane.number, "start"], nodes[lane.number, "end"]
         rows.append(
-            f'<edge id="lane{lane.number}" from="n{ends[0]}" to="n{ends[1]}" numLanes="1" width="{lane.width_m:.2f}" '
+            f'<edge id="{lane.name}" from="n{ends[0]}" to="n{ends[1]}" numLanes="1" width="{lane.width_m:.2f}" '
             f'speed="{lane.high_speed_m_per_s:.2f}" spreadType="center" shape={quoteattr(shape)}/>'
         )
     return _document("edges", rows)
 
 
 def _connections_xml(network: RoadNetwork) -> str:
+    name = [lane.name for lane in network.lanes]
     rows = [
-        f'<connection from="lane{start}" to="lane{end}" fromLane="0" toLane="0"/>' for start, end in network.connections
+        f'<connection from="{name[start]}" to="{name[end]}" fromLane="0" toLane="0"/>'
+        for start, end in network.connections
     ]
     return _document("connections", rows)
 
 
 def _routes_xml(network: RoadNetwork) -> str:
-    rows = ['<vType id="car" vClass="passenger"/>']
+    rows, name = ['<vType id="car" vClass="passenger"/>'], [lane.name for lane in network.lanes]
     for trip in network.trips:
-        edges = " ".join(f"lane{number}" for number in trip.lanes)
+        edges = " ".join(name[number] for number in trip.lanes)
         rows.append(
             f'<vehicle id="{trip.track_id}" type="car" depart="{trip.depart_s:.2f}" departSpeed="max">'
             f'<route edges="{edges}"/></vehicle>'
@@ -129,10 +136,16 @@ def _routes_xml(network: RoadNetwork) -> str:
 
 
 def _edge_data_xml(network: RoadNetwork) -> str:
-    """Measured speed and vehicle count of each lane, in SUMO's format of results, to compare and to calibrate."""
+    """Space-mean speed and vehicle count of each lane, in SUMO's format of results, to compare and to calibrate.
+
+    As SUMO's own, ``speed`` is the distance driven over the time spent, stops included; it is left out where too few
+    vehicles were seen.
+    """
     rows = [f'<interval begin="0.00" end="{max(network.duration_s, 0.01):.2f}" id="velfield">']
     rows += [
-        f'    <edge id="lane{lane.number}" speed="{lane.speed_m_per_s:.2f}" entered="{lane.vehicles}"/>'
+        f'    <edge id="{lane.name}" '
+        + (f'speed="{lane.speed_m_per_s:.2f}" ' if lane.speed_m_per_s is not None else "")
+        + f'entered="{lane.vehicles}"/>'
         for lane in network.lanes
     ]
     return _document("meandata", [*rows, "</interval>"])
@@ -140,6 +153,7 @@ def _edge_data_xml(network: RoadNetwork) -> str:
 
 def _turns_xml(network: RoadNetwork) -> str:
     """Vehicles from lane to lane by 15 minutes of their departure, in SUMO's format of edge relations."""
+    name = [lane.name for lane in network.lanes]
     turns: defaultdict[int, Counter[tuple[int, int]]] = defaultdict(Counter)
     for trip in network.trips:
         turns[int(trip.depart_s // BIN_S)].update(pairwise(trip.lanes))
@@ -148,7 +162,7 @@ def _turns_xml(network: RoadNetwork) -> str:
         end = min((k + 1) * BIN_S, max(network.duration_s, 0.01))
         rows.append(f'<interval begin="{k * BIN_S:.2f}" end="{end:.2f}" id="velfield">')
         rows += [
-            f'    <edgeRelation from="lane{a}" to="lane{b}" count="{count}"/>'
+            f'    <edgeRelation from="{name[a]}" to="{name[b]}" count="{count}"/>'
             for (a, b), count in sorted(turns[k].items())
         ]
         rows.append("</interval>")
