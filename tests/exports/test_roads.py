@@ -219,6 +219,9 @@ def test_traffic_that_goes_straight_on_meets_at_a_node_and_is_counted(crossroads
     edges = {edge.get("id"): edge for edge in ET.parse(tmp_path / "velfield.edg.xml").getroot()}
     assert len({edges[lanes[f"to {way}"].name].get("to") for way in "NE"}) == 1
     assert len({edges[lanes[one].name].get("to" if one.startswith("to") else "from") for one in lanes}) == 1
+    kinds = {node.get("id"): node.get("type") for node in ET.parse(tmp_path / "velfield.nod.xml").getroot()}
+    met = edges[lanes["to N"].name].get("to")
+    assert {node for node, kind in kinds.items() if kind == "traffic_light"} == {met}
     turns = {
         (turn.get("from"), turn.get("to")): int(turn.get("count", ""))
         for turn in ET.parse(tmp_path / "velfield.turns.xml").getroot().iter("edgeRelation")
@@ -283,12 +286,12 @@ def test_lanes_are_cut_at_intersections_and_those_within_have_no_part() -> None:
     zero = np.zeros(len(track))
     samples = LaneSamples(track.astype(np.int64), lane.astype(np.int64), along, zero, along, zero + 1)
     links = (Connection(1, 2, 4, 1.0, "straight"), Connection(2, 3, 4, 1.0, "straight"))
-    parts = cut_at_intersections(LaneGraph(lanes, links, (), samples), [square, square + np.array([60.0, 0.0])])
+    parts = cut_at_intersections(LaneGraph(lanes, links, (), samples), {0: square, 3: square + np.array([60.0, 0.0])})
     assert parts.names == ("lane0#0", "lane0#1", "lane0#2", "lane1", "lane3")
-    assert parts.ends == ((None, 0), (0, 1), (1, None), (None, 0), (0, None))
+    assert parts.ends == ((None, 0), (0, 3), (3, None), (None, 0), (0, None))
     assert parts.connections == ((0, 1), (1, 2), (3, 4))
     assert [part.tracks for part in parts.graph] == [4] * 5
     assert parts.graph.samples.along_m.max() <= max(part.length_m for part in parts.graph)
-    whole = cut_at_intersections(LaneGraph(lanes, links, (), samples), [])
+    whole = cut_at_intersections(LaneGraph(lanes, links, (), samples), {})
     assert whole.names == ("lane0", "lane1", "lane2", "lane3")
     assert whole.connections == ((1, 2), (2, 3))

@@ -52,12 +52,14 @@ class Trip:
 
 @dataclass(frozen=True)
 class RoadNetwork:
-    """Lanes, connections (from, to), trips in order of time, and the time that is seen, s."""
+    """Lanes, connections (from, to), trips in order of time, and the time that is seen, s; ``signalised``: numbers of
+    the intersections with a signal."""
 
     lanes: tuple[RoadLane, ...]
     connections: tuple[tuple[int, int], ...]
     trips: tuple[Trip, ...]
     duration_s: float
+    signalised: frozenset[int] = frozenset()
 
 
 def road_network(run: Run) -> RoadNetwork:
@@ -73,7 +75,7 @@ def road_network(run: Run) -> RoadNetwork:
     graph = traffic.lanes
     if not len(graph):
         raise InputError("no lanes were found in the tracks of this run; a longer flight shows more traffic")
-    meet = [j.hull_m for j in graph.junctions if traffic.junction_kind(j.number) == "intersection"]
+    meet = {j.number: j.hull_m for j in graph.junctions if traffic.junction_kind(j.number) == "intersection"}
     parts, georeference = cut_at_intersections(graph, meet), Georeference.from_grid(run.grid)
     on_parts, lanes = LaneTraffic(parts.graph), []
     for lane, of, name, (begins_at, ends_at) in zip(parts.graph, parts.lanes, parts.names, parts.ends, strict=True):
@@ -96,7 +98,8 @@ def road_network(run: Run) -> RoadNetwork:
     first_s = float(trajectories.time_s.min()) if len(trajectories.time_s) else 0.0
     trips = _trips(samples.track, samples.lane, samples.time_s - first_s, samples.speed_m_per_s, set(connections))
     named = tuple(replace(trip, track_id=int(trajectories.track_id[trip.track_id])) for trip in trips)
-    return RoadNetwork(tuple(lanes), connections, named, float(np.diff(trajectories.window_s)[0]))
+    signalised = frozenset(number for number in meet if traffic.is_signalised(number))
+    return RoadNetwork(tuple(lanes), connections, named, float(np.diff(trajectories.window_s)[0]), signalised)
 
 
 def _trips(

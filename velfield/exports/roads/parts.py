@@ -1,7 +1,7 @@
 """Lanes cut at intersections: what formats of roads need, where lanes that cross meet in a node."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -38,8 +38,8 @@ class LaneParts:
     connections: tuple[tuple[int, int], ...]
 
 
-def cut_at_intersections(graph: LaneGraph, hulls_m: Sequence[FloatArray]) -> LaneParts:
-    """The parts of a graph's lanes outside the areas (k, 2) of intersections.
+def cut_at_intersections(graph: LaneGraph, hulls_m: Mapping[int, FloatArray]) -> LaneParts:
+    """The parts of a graph's lanes outside the areas (k, 2) of intersections, given by their numbers.
 
     Parts are connected where their lanes are, where they follow each other on one lane, and through an intersection
     where at least `MIN_TRACKS` vehicles went from the one to the other. Lanes within an intersection have no part.
@@ -51,7 +51,7 @@ def cut_at_intersections(graph: LaneGraph, hulls_m: Sequence[FloatArray]) -> Lan
     part, along = np.full(len(graph.samples), -1), graph.samples.along_m.copy()
     for lane in graph:
         at = np.full(len(lane.xy_m), -1)
-        for k, hull in enumerate(hulls_m):
+        for k, hull in hulls_m.items():
             at[inside_hull(lane.xy_m, hull)] = k
         runs = np.split(np.arange(len(at)), np.flatnonzero(np.diff(at)) + 1)
         outside = [run for run in runs if at[run[0]] < 0]

@@ -99,8 +99,14 @@ def _nodes_xml(network: RoadNetwork) -> str:
     for lane in network.lanes:
         places.setdefault(nodes[lane.number, "start"], []).append(lane.xy_m[0])
         places.setdefault(nodes[lane.number, "end"], []).append(lane.xy_m[-1])
-    rows = [(number, np.mean(xy, axis=0)) for number, xy in sorted(places.items())]
-    return _document("nodes", [f'<node id="n{k}" x="{x:.2f}" y="{y:.2f}" type="priority"/>' for k, (x, y) in rows])
+    signals = {nodes[lane.number, "start"] for lane in network.lanes if lane.begins_at in network.signalised}
+    signals |= {nodes[lane.number, "end"] for lane in network.lanes if lane.ends_at in network.signalised}
+    rows = []
+    for number, xy in sorted(places.items()):
+        x, y = np.mean(xy, axis=0)
+        kind = "traffic_light" if number in signals else "priority"
+        rows.append(f'<node id="n{number}" x="{x:.2f}" y="{y:.2f}" type="{kind}"/>')
+    return _document("nodes", rows)
 
 
 def _edges_xml(network: RoadNetwork) -> str:
