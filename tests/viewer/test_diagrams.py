@@ -43,6 +43,7 @@ def test_arms_of_a_turning_diagram_lie_where_their_roads_lead(turned_deg: float)
     road = dict(zip("ESWN", sides(turned_deg), strict=True))
     labels = {re.sub(r"^from |:.*", "", t.get_text().split("\n")[0]): t for t in axes.texts}
     assert set(labels) == set("NESW")
+    assert {arm for arm, t in labels.items() if "only leave" in t.get_text()} == {"N", "E"}
     for arm, text in labels.items():
         x, y = text.get_position()
         assert apart_deg(np.arctan2(y, x), road[arm]) < 2

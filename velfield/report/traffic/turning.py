@@ -69,7 +69,7 @@ def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
         side = "left" if outward[0] > 0.3 else "right" if outward[0] < -0.3 else "center"
         up = "top" if outward[1] > 0.7 else "bottom" if outward[1] < -0.7 else "center"
         x, y = _LABEL_AT * outward
-        axes.text(x, y, "\n".join(_label(arm, mine)), ha=side, va=up, fontsize=9, color=tone)
+        axes.text(x, y, "\n".join(_label(arm, mine, found)), ha=side, va=up, fontsize=9, color=tone)
     top, bottom = _vertical_range(found)
     axes.set(xlim=(-_ACROSS / 2, _ACROSS / 2), ylim=(bottom, top), aspect="equal")
     axes.axis("off")
@@ -87,9 +87,10 @@ def _movements(found: JunctionMovements, *, arm_in: str | None = None, arm_out: 
     return sorted(mine, key=lambda m: -(m.seen + m.inferred))
 
 
-def _label(arm: Arm, movements: list[Movement]) -> list[str]:
+def _label(arm: Arm, movements: list[Movement], found: JunctionMovements) -> list[str]:
     if not movements:
-        return [f"{arm.name}: no turns known from there"]
+        comes = arm.name in found.gates.arms_in.values()
+        return [f"{arm.name}: no turns known from there" if comes else f"{arm.name}: vehicles only leave by it"]
     counted = sum(m.seen + m.inferred for m in movements)
     total = max([counted, *((m.seen + m.inferred) / m.share.value for m in movements if m.share)])
     lines = [
@@ -106,7 +107,7 @@ def _vertical_range(found: JunctionMovements) -> tuple[float, float]:
     ends = [0.0]
     for arm in found.gates.arms:
         down = float(np.sin(angle[arm.name]))
-        high = _LINE * len(_label(arm, _movements(found, arm_in=arm.name)))
+        high = _LINE * len(_label(arm, _movements(found, arm_in=arm.name), found))
         at = _LABEL_AT * down
         ends += [at, at + high] if down > 0.7 else [at - high, at] if down < -0.7 else [at - high / 2, at + high / 2]
         ends.append(down - 0.3 * abs(np.cos(angle[arm.name])))  # arrows lie to both sides of an arm
