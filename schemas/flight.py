@@ -41,8 +41,8 @@ class FramesConfig(Model):
     def _has_time(self) -> Self:
         if self.start_s is not None and self.stop_s is not None and self.stop_s <= self.start_s:
             raise ValueError(
-                f"found stop_s = {self.stop_s:g}, expected it after start_s = {self.start_s:g}; both are s from "
-                "the first frame"
+                f"stop_s = {self.stop_s:g} (--stop-s) must be later than start_s = {self.start_s:g} (--start-s); both "
+                "count from the first frame, in s"
             )
         return self
 

@@ -51,11 +51,18 @@ def write_simulation(
     """Write a simulated flight, or a clip of it, with progress."""
     from flows.console import Console
     from schemas.simulation import SimulationConfig
+    from velfield.pipeline.configuration import from_options
     from velfield.synthetic.write import write_flight
 
     width, height = parse_frame_size(size, "as 1280x960")
     console = Console("quiet" if quiet else "normal")
-    config = SimulationConfig(frames=frames, width=width, height=height, seed=seed)
+    options = {
+        "frames": (f"--frames {frames}", frames),
+        "width": (f"--size {size}", width),
+        "height": (f"--size {size}", height),
+        "seed": (f"--seed {seed}", seed),
+    }
+    config = from_options(SimulationConfig, options)
     config = config if clip is None else config.as_clip(clip, fps=fps)
     with console.stage("simulate", "simulate", frames) as progress:
         write_flight(out, config, lambda done, _total: progress.at_least(done))

@@ -63,6 +63,17 @@ def command(
         (("run", "a", "--out", "out", "--set", "tracking.max_sped_m_per_s=1"), 1, "did you mean"),
         (("run", "a", "--out", "out", "--every", "often"), 1, "--every often"),
         (("simulate", "out", "--size", "big"), 1, "WIDTHxHEIGHT"),
+        (("simulate", "out", "--frames", "0"), 1, "--frames 0: input should be greater than 0 (number of frames)"),
+        (("simulate", "out", "--frames", "-5"), 1, "--frames -5: input should be greater than 0"),
+        (("simulate", "out", "--size", "640x20"), 1, "--size 640x20: input should be greater than or equal to 64 (he"),
+        (("simulate", "out", "--seed", "-1"), 1, "--seed -1: input should be greater than or equal to 0"),
+        (("demo", "--out", "out", "--frames", "0"), 1, "--frames 0: input should be greater than 0"),
+        (("demo", "--out", "out", "--size", "10x10"), 1, "--size 10x10: input should be greater than or equal to 64"),
+        (
+            ("run", "a", "--out", "out", "--start-s", "5", "--stop-s", "3"),
+            1,
+            "velfield: configuration: frames: stop_s = 3 (--stop-s) must be later than start_s = 5 (--start-s); ",
+        ),
     ],
 )
 def test_a_command_that_cannot_be_is_one_line(
@@ -78,7 +89,7 @@ def test_a_command_that_cannot_be_is_one_line(
     assert (found, len(lines)) == (status, 1), lines
     assert lines[0].startswith("velfield: ")
     assert text in lines[0]
-    assert not (tmp_path / "out" / "commits").exists()
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -139,7 +150,7 @@ def test_a_plan_reads_the_inputs_too(
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        (["frames.start_s=3", "frames.stop_s=1"], "found stop_s = 1, expected it after start_s = 3"),
+        (["frames.start_s=3", "frames.stop_s=1"], "stop_s = 1 (--stop-s) must be later than start_s = 3"),
         (["tracking.stationary_speed_m_per_s=50"], "no vehicle could move"),
         (["tracking.max_turn_rad=30"], "max_turn_rad"),  # degrees
         (["field.bin_width_m_per_s=0.01"], "7200 bins an axis"),

@@ -66,7 +66,12 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
     ("settings", "text"),
     [
         (["tracking.max_sped_m_per_s=20"], "did you mean 'tracking.max_speed_m_per_s'"),
-        (["tracking.foo=3"], "did you mean 'tracking."),
+        (["tracking.max_sped=20"], "did you mean 'tracking.max_speed_m_per_s'"),
+        (["trackin.max_speed_m_per_s=20"], "unknown key 'trackin'; did you mean 'tracking'?"),
+        (["max_turn=20"], "did you mean 'tracking.max_turn_rad'"),
+        (["frames.evry=2"], "did you mean 'frames.every'"),
+        (["gsd=0.2"], "did you mean 'gsd_m'"),
+        (["tracking.foo=3"], "unknown key 'tracking.foo'; `velfield schema` lists the keys"),
         (["tracking.max_speed_m_per_s=.nan"], "finite"),
         (["tracking.max_speed_m_per_s=.inf"], "finite"),
         (["tracking.max_speed_m_per_s=-1"], "greater than 0"),

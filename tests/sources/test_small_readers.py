@@ -110,9 +110,9 @@ def test_frames_nearest_to_an_interval_ascend_and_none_would_be_nearer(steps: li
 
 def test_of_frames_of_one_time_the_first_is_chosen_and_no_time_at_all_is_refused() -> None:
     assert select_frames(np.array([0, 0, 1, 1, 1, 2.0]), FramesConfig(every=1)).tolist() == [0, 2, 5]
-    with pytest.raises(InputError, match=r"found no frame from 3 s to inf s, the source lasts 2\.000 s"):
+    with pytest.raises(InputError, match=r"found no frame from 3 s on: the source lasts 2\.000 s"):
         select_frames(np.arange(3.0), FramesConfig(every=1, start_s=3.0))
-    with pytest.raises(ValidationError, match="found stop_s = 1, expected it after start_s = 1"):
+    with pytest.raises(ValidationError, match=r"stop_s = 1 \(--stop-s\) must be later than start_s = 1"):
         FramesConfig(every=1, start_s=1.0, stop_s=1.0)
     with pytest.raises(InputError, match="the source has no frames"):
         select_frames(np.zeros(0), FramesConfig())

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, TypeVar, cast, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -16,6 +16,9 @@ from velfield.errors import IneffectiveSettingWarning, InputError
 from velfield.sources.table import read_text
 
 Tree = dict[str, Any]
+ModelT = TypeVar("ModelT", bound=BaseModel)
+_SIMILAR = 0.6
+"""Similarity from which an unknown key is taken for a misspelt one."""
 
 
 def resolve_config(
@@ -69,6 +72,33 @@ def resolve_config(
     for message in _ineffective(config, given):
         warnings.warn(message, IneffectiveSettingWarning, stacklevel=2)
     return config
+
+
+def from_options(model: type[ModelT], options: Mapping[str, tuple[str, object]]) -> ModelT:
+    """A model from options of the command line.
+
+    Parameters
+    ----------
+    options
+        Field -> the option as it was given, for the message, and the field's value.
+
+    Raises
+    ------
+    InputError
+        A value out of range; the message names the option.
+
+    Examples
+    --------
+    >>> from schemas.simulation import SimulationConfig
+    >>> from_options(SimulationConfig, {"frames": ("--frames 9", 9)}).frames
+    9
+    """
+    try:
+        return model.model_validate({name: value for name, (_, value) in options.items()})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0])
+        raise InputError(f"{options[name][0]}: {_problem(first['msg'])}{_what_is(model, name)}") from None
 
 
 def _of_methods(preset: Mapping[str, Any], given: Mapping[str, Any]) -> Tree:
@@ -177,8 +207,10 @@ def _validate(tree: Tree, what: str) -> FlightConfig:
         if first["type"] == "union_tag_invalid":
             found, expected = first["ctx"]["tag"], first["ctx"]["expected_tags"]
             raise InputError(f"{what}: {where}.method = {found!r}: expected one of {expected}") from None
-        problem = "expected keys with values" if first["type"] == "union_tag_not_found" else first["msg"].lower()
-        raise InputError(f"{what}: {where} = {first['input']!r}: {problem}{_what_is(where)}") from None
+        problem = "expected keys with values" if first["type"] == "union_tag_not_found" else _problem(first["msg"])
+        # What a section's keys are together has no one value: the problem names them.
+        found = where if first["type"] == "value_error" and not path else f"{where} = {first['input']!r}"
+        raise InputError(f"{what}: {found}: {problem}{_what_is(FlightConfig, where)}") from None
 
 
 def _parts(location: Sequence[str | int]) -> tuple[str, str | None, tuple[str, ...]]:
@@ -207,17 +239,41 @@ def _unread(section: str, method: str, key: str) -> str:
     )
 
 
-def _what_is(key: str) -> str:
+def _problem(message: str) -> str:
+    """The message of an error without what stands before those of our own checks."""
+    return message.removeprefix("Value error, ") if message.startswith("Value error, ") else message.lower()
+
+
+def _what_is(model: type[BaseModel], key: str) -> str:
     """What a key outside the sections is, with its unit."""
-    info = FlightConfig.model_fields.get(key)
-    return "" if info is None or info.description is None else f" ({info.description.partition(';')[0].lower()})"
+    info = model.model_fields.get(key)
+    return (
+        ""
+        if info is None or info.description is None
+        else f" ({info.description.partition(';')[0].rstrip('.').lower()})"
+    )
 
 
 def _did_you_mean(key: str) -> str:
-    keys = list(_keys(FlightConfig))
-    sections = {name.rpartition(".")[0] for name in keys}
-    close = difflib.get_close_matches(key, [name for name in keys if name not in sections], n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else "; `velfield schema` lists the keys"
+    """The known key or section most like one that is not: of its own section where there is one, else of any."""
+    names = list(_keys(FlightConfig))
+    section, _, last = key.rpartition(".")
+
+    def similarity(name: str) -> tuple[float, float]:
+        other = name.rpartition(".")[2]
+        # Beginnings count, as `max_sped` of `max_speed_m_per_s`: people leave out the unit.
+        begin = _ratio(last, other[: len(last)]) if other.startswith(last[:3]) else 0.0
+        return max(begin, _ratio(last, other)), _ratio(key, name)
+
+    for candidates in ([name for name in names if name.rpartition(".")[0] == section], names):
+        best = max(candidates, key=similarity, default=key)
+        if best != key and similarity(best)[0] >= _SIMILAR:
+            return f"; did you mean {best!r}?"
+    return "; `velfield schema` lists the keys"
+
+
+def _ratio(one: str, other: str) -> float:
+    return difflib.SequenceMatcher(None, one, other).ratio()
 
 
 def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:

@@ -43,8 +43,9 @@ def select_frames(times_s: FloatArray, frames: FramesConfig) -> IntArray:
     tolerance = 1e-9  # a start given as a frame's own time must not lose that frame to rounding
     inside = np.flatnonzero(later & (since_first >= start_s - tolerance) & (since_first < stop_s - tolerance))
     if inside.size == 0:
+        until = "on" if frames.stop_s is None else f"to {stop_s:g} s"
         raise InputError(
-            f"found no frame from {start_s:g} s to {stop_s:g} s, the source lasts {since_first[-1]:.3f} s; "
+            f"found no frame from {start_s:g} s {until}: the source lasts {since_first[-1]:.3f} s; "
             "--start-s and --stop-s count from the first frame, in s"
         )
     if frames.every == "auto":
