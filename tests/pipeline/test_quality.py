@@ -85,6 +85,11 @@ def test_they_are_reported(run: tuple[Path, RunSummary]) -> None:
     assert stage.text.startswith(f"{COUNT - len(FAULTS)} frames usable, {len(FAULTS)} flagged: ")
     warnings = [warning for stage in summary.stages for warning in stage.warnings]
     assert {int(re.findall(r"^frame (\d+)", warning)[0]) for warning in warnings} == set(FAULTS)
+    told = [warning for warning in warnings if warning.startswith(f"frame {DUPLICATE} (")]
+    assert re.fullmatch(
+        rf"frame {DUPLICATE} \(\d\.\d{{3}} s, source frame \S*{DUPLICATE}\.png\): the same image as the frame before",
+        told[0],
+    )
     report = (root / "index.html").read_text()
     assert all(warning in report for warning in warnings)
 

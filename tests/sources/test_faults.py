@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from schemas.flight import FramesConfig
+from schemas.flight import FlightConfig, FramesConfig
+from schemas.job import Inputs, Job
 from tests.media import drifting, flip_bytes, ground, write_images, write_times, write_video
 from velfield.errors import InputError
+from velfield.pipeline.plan import make_plan
 from velfield.sources.frame_measures import frame_quality
 from velfield.sources.quality import (
     UNUSABLE,
@@ -82,7 +84,7 @@ def test_a_video_cut_within_the_run_yields_its_lost_frames_as_unreadable(tmp_pat
     read = list(iter_frames(path, info, range(0, 60, 5)))
     assert [frame.source_index for frame in read] == list(range(0, 60, 5))
     assert read[-1].flags & FrameFlag.UNREADABLE
-    assert "frame 55 at" in read[-1].reason
+    assert (read[-1].name, read[-1].reason) == ("55", "the decoder returned no image")
 
 
 def test_an_avi_that_repeats_images_is_no_truncated_one(tmp_path, frames):
@@ -95,6 +97,36 @@ def test_an_avi_that_repeats_images_is_no_truncated_one(tmp_path, frames):
     assert [frame.flags for frame in read] == [0] * 8
     (tmp_path / "b.avi").write_bytes(whole.read_bytes()[: int(0.6 * whole.stat().st_size)])
     assert any("the file is truncated" in warning for warning in probe(tmp_path / "b.avi", frames=ALL).warnings)
+
+
+@pytest.mark.parametrize(
+    ("count", "kept", "options", "expected"),
+    [
+        (1, 1.0, {}, "1 frame to process, but a tracklet needs 3; give a longer recording"),
+        (1, 1.0, {"every": 1, "stop_s": 9.0}, "1 frame to process, but a tracklet needs 3; give a longer recording"),
+        (20, 0.1, {}, "3 frames read of 20 declared: the file is truncated, copy it again; set --every 1"),
+        (20, 0.05, {}, "2 frames read of 20 declared: the file is truncated, copy it again; give a longer recording"),
+        (20, 1.0, {"every": 15}, "2 frames to process, but a tracklet needs 3; set --every 1"),
+        (
+            20,
+            1.0,
+            {"every": 1, "stop_s": 0.05},
+            "2 frames to process, but a tracklet needs 3; widen --start-s/--stop-s",
+        ),
+    ],
+)
+def test_too_few_frames_are_said_with_what_can_help(tmp_path, frames, count, kept, options, expected):
+    whole = write_video(tmp_path / "a.avi", frames[:count], codec="mpeg4", key_interval=1)
+    (tmp_path / "b.avi").write_bytes(whole.read_bytes()[: int(kept * whole.stat().st_size)])
+    job = Job(
+        root=str(tmp_path / "run"),
+        inputs=Inputs(source=str(tmp_path / "b.avi")),
+        config=FlightConfig(frames=FramesConfig(**options)),
+    )
+    with pytest.raises(InputError) as caught:
+        make_plan(job)
+    assert str(caught.value).startswith(f"{tmp_path / 'b.avi'}: ")
+    assert str(caught.value).endswith(expected)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -202,6 +234,7 @@ def test_missing_duplicate_black_blurred_and_outlier_frames_are_flagged(tmp_path
     assert any("1 frames of t.csv are not in f (f9.png)" in warning for warning in info.warnings)
     read = list(iter_frames(tmp_path / "f", info, range(8)))
     assert [describe_flags(frame.flags) for frame in read[:5]] == ["", "", "duplicate", "black", ""]
+    assert [frame.reason for frame in read[2:4]] == ["the same image as the frame before", "black, or without detail"]
     quality = [frame_quality(frame.grey) for frame in [*read, *read[4:5]]]
     assert np.flatnonzero(flag_blurred(np.array([q.sharpness for q in quality]))).tolist() == [3, 5]
     assert np.flatnonzero(flag_outlier_frames(np.array([q.thumbnail for q in quality]))).tolist() == [3, 7]

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.flight import FlightConfig
+from schemas.flight import FlightConfig, FramesConfig
 from schemas.job import Inputs, Job
 from schemas.records import FlightRecord, InputsRecord, SourceRecord
-from velfield.errors import InputError
+from velfield.errors import InputError, count_text
 from velfield.field.time_intervals import TimeInterval, parse_time_intervals
 from velfield.pipeline.stage import stage_keys
 from velfield.run.commits import code_version, content_key, digest_bytes, digest_path, sealed_json, write_atomically
 from velfield.run.flight_record import check_format, read_flight_record
 from velfield.run.layout import RunLayout, is_remote, to_path
 from velfield.sources.clips import CLIPS_SUFFIX, clip_files, read_clip_list, write_clip_list
-from velfield.sources.frames import SourceInfo, local_path
+from velfield.sources.frames import FootageLoss, SourceInfo, local_path
 from velfield.sources.selection import select_frames
 from velfield.sources.source import check_source, probe
 from velfield.sources.telemetry.find import find_beside
@@ -146,16 +146,25 @@ def make_plan(job: Job) -> Plan:
     info = probe(Path(job.inputs.source), frames=job.config.frames, timestamps=timestamps)
     indices = select_frames(info.times_s, job.config.frames)
     if len(indices) < 3:
-        raise InputError(
-            f"{job.inputs.source}: {len(indices)} frames to process, but a tracklet needs 3; "
-            "widen --start-s/--stop-s or lower --every"
-        )
+        raise InputError(f"{job.inputs.source}: {_too_few(job.config.frames, info, len(indices))}")
     info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))
     inputs = _digest_inputs(job, info)
     plan = Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
     _ = plan.time_intervals  # refuses impossible intervals now, not where the field is built
     check_same_flight(plan)
     return plan
+
+
+def _too_few(frames: FramesConfig, info: SourceInfo, count: int) -> str:
+    """Message that ``count`` frames are too few, with what the source lacks and the options that can help."""
+    lost = [warning for warning in info.warnings if isinstance(warning, FootageLoss)]
+    remedies = []
+    if info.frame_count >= 3 and (frames.start_s is not None or frames.stop_s is not None):
+        remedies.append("widen --start-s/--stop-s")
+    if info.frame_count >= 3 and frames.every != 1:
+        remedies.append("set --every 1")
+    found = f"{count_text(count, 'frame')} to process, but a tracklet needs 3"
+    return "; ".join((found, *lost, " or ".join(remedies or ["give a longer recording"])))
 
 
 def _with_telemetry(job: Job) -> Job:

@@ -105,7 +105,7 @@ def _read(path: Path, info: SourceInfo, index: int) -> SourceFrame:
         check_size(path / name, *image_size(path / name, max_pixels=info.max_pixels), info.max_pixels)
         grey = read_grey_image(path / name, info.max_pixels, info.levels)
     except InputError as error:
-        return unreadable_frame(path, info, index, int(FrameFlag.UNREADABLE), str(error))
+        return unreadable_frame(info, index, int(FrameFlag.UNREADABLE), str(error))
     if grey.shape != info.shape:
         raise InputError(
             f"{path.name}: found {name} of {grey.shape[1]}x{grey.shape[0]}, expected {info.width}x{info.height}; "

@@ -79,7 +79,7 @@ class SourceFrame:
     flags
         Bits of `velfield.sources.quality.FrameFlag`.
     reason
-        The fault, in one line; empty if there was none.
+        The fault, in one line, without the frame's name; empty if there was none.
     """
 
     source_index: int
@@ -156,8 +156,8 @@ class SourceInfo:
         return self.height, self.width
 
 
-def unreadable_frame(path: Path, info: SourceInfo, index: int, flags: int, reason: str) -> SourceFrame:
+def unreadable_frame(info: SourceInfo, index: int, flags: int, reason: str) -> SourceFrame:
     """Stand-in for a frame that could not be read: zeros, with the reason."""
-    time_s = float(info.times_s[index])
-    where = f"{path.name}: frame {info.names[index]} at {time_s:.3f} s"
-    return SourceFrame(index, info.names[index], time_s, np.zeros(info.shape, np.uint8), flags, f"{where}: {reason}")
+    return SourceFrame(
+        index, info.names[index], float(info.times_s[index]), np.zeros(info.shape, np.uint8), flags, reason
+    )

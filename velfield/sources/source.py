@@ -138,5 +138,5 @@ def _with_content_flags(frame: SourceFrame, previous: SourceFrame | None) -> Sou
         reasons.append("black, or without detail")
     if previous is not None and (frame.time_s <= previous.time_s or is_duplicate(frame.grey, previous.grey)):
         flags |= FrameFlag.DUPLICATE
-        reasons.append(f"the same as frame {previous.name}")
+        reasons.append("the same image as the frame before")
     return replace(frame, flags=int(flags), reason="; ".join(reasons))

@@ -140,7 +140,7 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
         store.write(frames[k], found.grey)
         flags[k] = found.flags
         if found.reason:
-            warnings.append(f"frame {frames[k]}: {found.reason}")
+            warnings.append(f"frame {frames[k]} ({found.time_s:.3f} s, source frame {found.name}): {found.reason}")
         if not found.flags & FrameFlag.UNREADABLE:
             quality = frame_quality(found.grey)
             sharpness[k], brightness[k], thumbnails[k] = quality.sharpness, quality.brightness, quality.thumbnail

@@ -147,10 +147,10 @@ def _read_csv(path: Path, text: str) -> pd.DataFrame:
         if len(header) not in (9, 10) or separator != ",":
             raise InputError(f"{path}: found numbers in line 1, expected a header; name the columns there")
         names = [*MOT_COLUMNS[: len(header)]]
-    elif len(header) < 3:
+    elif len(header) == 1:
         raise InputError(
-            f"{path}: found {len(header)} columns in line 1 ({text[:60].splitlines()[0]!r}), expected those of track, "
-            "time and position; separate them with commas, semicolons or tabs"
+            f"{path}: found 1 column in line 1 ({text[:60].splitlines()[0]!r}), expected those of track, time and "
+            "position; separate them with commas, semicolons or tabs"
         )
     for number, row in enumerate(rest, 2):
         if len(row) > len(header) and any(row[len(header) :]):

@@ -329,21 +329,19 @@ def _entry_points(info: SourceInfo, first: int, *, groups_before: int = 0) -> li
 def _source_frame(path: Path, info: SourceInfo, decoded: _Decoded, corruption: CorruptionTracker) -> SourceFrame:
     index, grey, suspect = decoded
     if grey is None:
-        return unreadable_frame(path, info, index, int(FrameFlag.UNREADABLE), "the decoder returned no image")
+        return unreadable_frame(info, index, int(FrameFlag.UNREADABLE), "the decoder returned no image")
     suspect = suspect or corruption.is_suspect(index)
     time_s = float(info.times_s[index])
     if grey.shape != info.shape:
         found = f"{grey.shape[1]}x{grey.shape[0]}"
         if suspect:
             flags = int(FrameFlag.UNREADABLE | FrameFlag.SUSPECT)
-            return unreadable_frame(path, info, index, flags, f"corrupt: decoded as {found}")
+            return unreadable_frame(info, index, flags, f"corrupt: decoded as {found}")
         raise InputError(
             f"{path.name}: found frame {index} at {time_s:.3f} s of {found}, expected {info.width}x{info.height} "
             "as the frames before; use --stop-s, or cut the video there"
         )
-    reason = (
-        f"{path.name}: frame {index} at {time_s:.3f} s: bitstream corrupt ({corruption.last_error})" if suspect else ""
-    )
+    reason = f"bitstream corrupt ({corruption.last_error})" if suspect else ""
     return SourceFrame(index, info.names[index], time_s, grey, int(FrameFlag.SUSPECT) if suspect else 0, reason)
 
 

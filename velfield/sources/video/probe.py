@@ -13,7 +13,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
-from velfield.errors import InputError
+from velfield.errors import InputError, count_text
 from velfield.sources.frames import FootageLoss, SourceInfo
 from velfield.sources.images import check_size
 from velfield.sources.timestamps import check_against_container, read_timestamps
@@ -173,10 +173,16 @@ def _counts_as_declared(pts: IntArray, declared: int | None) -> bool:
 def _truncation_warning(times_s: FloatArray, declared: int | None, declared_s: float | None) -> tuple[str, ...]:
     """Warn where the container declares more frames or time than the file holds."""
     if declared is not None and times_s.size < declared:
-        return (FootageLoss(f"{times_s.size} frames read of {declared} declared: the file is truncated"),)
+        return (
+            FootageLoss(
+                f"{count_text(times_s.size, 'frame')} read of {declared} declared: the file is truncated, copy it again"
+            ),
+        )
     if declared is None and declared_s is not None and times_s.size > 1:
         step = float(np.median(np.diff(times_s)))
         lasts = float(times_s[-1] - times_s[0]) + step
         if lasts < declared_s - max(2 * step, 0.02 * declared_s):
-            return (FootageLoss(f"{lasts:.1f} s read of {declared_s:.1f} s declared: the file is truncated"),)
+            return (
+                FootageLoss(f"{lasts:.1f} s read of {declared_s:.1f} s declared: the file is truncated, copy it again"),
+            )
     return ()
