@@ -9,6 +9,7 @@ from velfield.camera.frame_pairs import FramePairs, ScaledLens
 from velfield.camera.fusion import MAX_RESIDUAL, refine_lens
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
 from velfield.camera.multiview import MultiViewFit
+from velfield.pipeline.stages.lens import _notes
 
 SHAPE = (480, 640)
 HALF = 400.0
@@ -66,6 +67,8 @@ def test_estimates_that_agree_are_fused_by_inverse_variance(monkeypatch: pytest.
     assert refined.a_sd == pytest.approx(0.01 / np.sqrt(2))
     assert "fused to 0.210" in reason(refined)
     assert refined.reason.startswith("plumb line; then multi-view a = 0.220 +- 0.010 from 9 pairs of 6 frames")
+    (note,) = _notes(refined)
+    assert note == "the lens distortion was refined by frames that show the same ground at different places"
     assert families[0].lens(np.array([0.2, 0.0, 0.0])) == lens_from_record(record(0.2).lens)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from flows.commands.run import run as run_command
 from flows.commands.verify import DAMAGED, WHOLE, verify
+from schemas.export import ExportOptions
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
@@ -17,6 +18,7 @@ from tests.analysis.test_traffic_analysis import crossroads, gather
 from tests.small_flight import digests
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
+from velfield.exports.export import export_run
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
 from velfield.pipeline.given_tracks.write import at_frames
@@ -125,6 +127,14 @@ def test_the_run_is_whole(run: Run) -> None:
     assert verify_run(run.layout, run.record) == []
 
 
+def test_a_video_of_it_is_refused_with_what_shows_it(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match="was made from tracks and has no images for a video; replay it by `velfield v"
+    ):
+        export_run(run, "video", tmp_path / "clip.mp4", ExportOptions())
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_run_has_its_vehicles_and_times(run: Run) -> None:
     t = truth()
     assert run.times_s[-1] == pytest.approx(t["time_s"].max() - t["time_s"].min(), abs=0.21)
@@ -204,6 +214,8 @@ def test_positions_are_interpolated_over_short_gaps_alone() -> None:
         ("id,time,x_px,y_px\n1,0,1,1\n1,1,9,9\n1,2,9,9\n", {}, "--gsd-m"),
         ("id,time,x_m,y_m\n1,0,1,1\n1,1,9,9\n1,2,19,9\n2,0,9e7,9\n", {}, "too large a map"),
         ("id,time,x_m,y_m\n1,0,1,1\n1,1,9,9\n", {}, "expected 3 or more"),
+        ("foo,bar\n1,2\n3,4\n", {}, r"found the columns foo, bar, expected x and y; name them track_id, time_s"),
+        ("foo\n1\n", {}, r"found 1 column in line 1"),
         ("id,time,x_px,y_px\n1,0,-9,1\n1,1,39,9\n1,2,99,9\n", {"gsd_m": 0.2}, "none below 0"),
     ],
 )

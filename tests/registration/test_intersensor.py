@@ -111,13 +111,18 @@ def test_the_error_map_covers_the_ground_seen_and_nothing_else(ground: np.ndarra
     assert result.source_raw.shape == result.target.shape == (len(result.cv_errors_px), 2)
 
 
-def test_another_place_is_refused_with_the_scores(base: np.ndarray) -> None:
+def test_another_place_is_refused_in_one_clause_and_its_scores_are_logged(
+    base: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("DEBUG", logger="velfield")
     image = photograph(city(77, 900, blocks=220), view(1.0, 5.0), LENS, SHAPE, 1)
     result = register_intersensor(image, base, CONFIG, lens=LENS)
     assert isinstance(result, Failure)
-    assert "not an image of this flight's area; give one" in result.reason
-    assert "SIFT (intensity): " in result.reason
-    assert "inliers of" in result.reason
+    assert result.reason == (
+        "not an image of this flight's area; give one of the area, seen from above, at 0.5 to 2 times the frames' scale"
+    )
+    assert "SIFT (intensity): " in caplog.text
+    assert "inliers of" in caplog.text
     assert "\n" not in result.reason
 
 

@@ -46,7 +46,7 @@ def check_base_area(plan: Plan) -> None:
     Raises
     ------
     InputError
-        Neither registers: with the scores.
+        Neither registers.
     """
     grey = _middle_frame(plan)
     if grey is None:

@@ -47,14 +47,22 @@ def write(run: Run, path: Path, options: ExportOptions, progress: Progress) -> N
     Raises
     ------
     InputError
-        It would be too large, or no frame is registered.
+        It would be too large, or the run has no images: it was made from tracks or merged, or no frame is registered.
     """
     import av  # loaded by this format alone
 
+    run.require_frames()
+    if not run.has_frames:
+        raise InputError(
+            f"{run.layout.root} was made from tracks and has no images for a video; replay it by `velfield view`, or "
+            "export another format, such as speed or poster"
+        )
     scene = _Scene.of(run, options)
     frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]
     if not frames:
-        raise InputError(f"{run.layout.root}: found no registered frame, expected some for a video")
+        raise InputError(
+            f"{run.layout.root}: found no registered frame, expected some for a video; the report says why none is"
+        )
     times_s = run.times_s
     seconds = float(times_s[frames[-1]] - times_s[frames[0]])
     rate = Fraction((len(frames) - 1) / seconds if seconds > 0 else 5.0).limit_denominator(1000)

@@ -59,7 +59,7 @@ def build_base(plan: Plan) -> StageResult:
     Raises
     ------
     InputError
-        The given base image does not show this area (with the scores), or too few frames overlap.
+        The given base image does not show this area, or too few frames overlap.
     """
     given = read_given_base(plan)
     detect = cache(partial(detect_frame_keypoints, plan))

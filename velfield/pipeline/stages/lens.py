@@ -79,10 +79,11 @@ def _warnings(plan: Plan, record: CameraRecord) -> list[str]:
 
 
 def _notes(record: CameraRecord) -> list[str]:
+    """What was decided, for people; the figures that decided it are in ``camera.json``."""
     if not record.accepted:
-        return [f"lens: {record.reason}"]
+        return ["no lens distortion is certain enough to correct: the frames are used as recorded"]
     if record.overlap is not None and record.overlap.used:
-        return [f"lens refined by frame pairs: {record.overlap.reason}"]
+        return ["the lens distortion was refined by frames that show the same ground at different places"]
     return []
 
 

@@ -4,9 +4,10 @@
 2. For each, coarse to fine, control points and a polyprojective (`control`).
 3. Verification: non-overlapping patches that the fit did not use are matched independently. Control points 50 px apart
    share most of their 75-px patches and agree with each other on a wrong area too; these do not. The first candidate
-   that is verified is the result. Each that fails leaves its scores, and the failure lists them in one line.
+   that is verified is the result. Each that fails leaves its scores, and the logger has them where all fail.
 """
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -35,6 +36,7 @@ from velfield.registration.intersensor.correlation import match_grid
 from velfield.registration.intersensor.modality import GRADIENT, MODALITIES, Modality
 from velfield.registration.transforms import FrameTransform
 
+_LOG = logging.getLogger(__name__)
 MIRRORED = "found a mirrored image"
 _CERTAIN_FRACTION = 0.5
 """With a smaller fraction of consistent patches, the flipped base image must not match too; a search does not count."""
@@ -125,7 +127,7 @@ def register_intersensor(
     Returns
     -------
     IntersensorResult or Failure
-        The failure's reason is one line with each candidate's scores.
+        The failure's reason is one line; each candidate's scores go to this module's logger, at level DEBUG.
     """
     if float(base.std()) < _MIN_BASE_CONTRAST_GREY:
         return Failure("found an image of one grey level, expected one of the flight's area; give another")
@@ -155,13 +157,13 @@ def _matches_flipped(pair: ImagePair) -> bool:
 
 
 def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
-    """Message with the cause of a failed registration, what to do, and the scores."""
+    """Message with the cause of a failed registration, and what to do."""
+    _LOG.debug("no candidate is verified: %s", "; ".join(scores))
     flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
     if flipped.matrix is not None:
         return f"{MIRRORED} ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
     return (
-        "not an image of this flight's area; give one of the area, seen from above, at 0.5 to 2 times the frames' "
-        f"scale ({'; '.join(scores)})"
+        "not an image of this flight's area; give one of the area, seen from above, at 0.5 to 2 times the frames' scale"
     )
 
 
