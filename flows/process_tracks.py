@@ -12,8 +12,8 @@ from schemas.job import Job, absolute
 from schemas.summary import RunSummary
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
 from velfield.pipeline.graphs import tracks_graph
+from velfield.pipeline.plan import check_folder
 from velfield.run.commits import sweep_partial
-from velfield.run.flight_record import check_format
 from velfield.run.layout import RunLayout
 from velfield.run.lock import locked
 
@@ -31,7 +31,7 @@ def run_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
 
 def process_tracks(job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:
     """Tracks in, velocity field out."""
-    check_format(Path(job.root))
+    check_folder(Path(job.root))
     plan = plan_tracks(job)  # refuses bad tracks before the folder is there
     layout = RunLayout(Path(job.root))
     with locked(layout, stop_lost), open_runner(runner, console.warn) as where:

@@ -96,9 +96,13 @@ def test_a_command_of_the_pages(page: str, line: str, request: pytest.FixtureReq
 
 @pytest.mark.parametrize(("page", "text"), blocks("python"))
 def test_a_snippet_of_the_pages(page: str, text: str, folder: Path) -> None:
-    names: dict[str, object] = {"xy": [[100.0, 100.0]], "v": [[10.0, 0.0]]}
+    """It defines the names that it uses: a reader pastes it as it stands."""
+    names: dict[str, object] = {}
     exec(compile(text, page, "exec"), names)
-    assert names.keys() - {"xy", "v", "__builtins__"}, "the snippet defines nothing, not even an import"
+    imported = set(re.findall(r"^from \S+ import (.+)$", text, re.MULTILINE))
+    unused = [name for line in imported for name in line.split(", ") if len(re.findall(rf"\b{name}\b", text)) < 2]
+    assert unused == []
+    assert names.keys() - {"__builtins__"}, "the snippet defines nothing, not even an import"
 
 
 def test_the_notebook_runs(folder: Path) -> None:

@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flows.console import Console
+from flows.orchestration import Threads
+from flows.process_tracks import process_tracks
+from flows.runners import RunnerConfig
 from schemas.job import Inputs, Job
 from schemas.records import InputsRecord, SourceRecord
 from tests.small_flight import job
@@ -15,8 +19,9 @@ from velfield.errors import InputError
 from velfield.pipeline.check_inputs import validate_inputs
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.estimate import describe_plan, planned_units
-from velfield.pipeline.plan import Plan, changed_since, make_plan, write_flight_record
+from velfield.pipeline.plan import Plan, changed_since, check_inputs, make_plan, write_clips, write_flight_record
 from velfield.pipeline.stage import stage_keys
+from velfield.run.layout import RunLayout
 from velfield.sources.frames import SourceInfo
 
 FOUR_HOURS = 72_000
@@ -83,6 +88,40 @@ def test_the_folder_of_another_flight_is_refused(flight: Path, tmp_path: Path) -
     shutil.move(tmp_path / last.name, last)
     write_flight_record(plan_with(grows))
     plan_with(moved)  # of the same content
+
+
+def test_a_folder_of_other_things_is_refused_and_nothing_is_written(flight: Path, tmp_path: Path) -> None:
+    root = tmp_path / "holiday"
+    (root / "album").mkdir(parents=True)
+    for name in ("a.jpg", "b.jpg", "c.txt"):
+        (root / name).touch()
+    before = sorted(root.iterdir())
+    said = r"holiday is not empty and no run folder: it holds a\.jpg, album, b\.jpg and 1 more; give another --out"
+    for refuse in (
+        lambda: check_inputs(job(flight, root)),
+        lambda: make_plan(job(flight, root)),
+        lambda: write_clips(root, [Path(job(flight, root).inputs.source)]),
+        lambda: process_tracks(job(flight, root), RunnerConfig(), Console("quiet"), Threads()),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            refuse()
+        assert "\n" not in str(caught.value)
+    assert sorted(root.iterdir()) == before
+
+
+def test_an_empty_folder_and_one_of_a_run_that_ended_early_are_taken(flight: Path, tmp_path: Path) -> None:
+    work = job(flight, tmp_path / "run")
+    layout = RunLayout(tmp_path / "run")
+    layout.root.mkdir()
+    make_plan(work)
+    for path in (layout.lock, layout.clips, layout.root / ".DS_Store"):
+        path.touch()
+    for path in (layout.frames, layout.commits, layout.preview):
+        path.mkdir()
+    make_plan(work)
+    write_flight_record(make_plan(work))
+    (layout.root / "notes.txt").touch()  # among the results of a run
+    make_plan(work)
 
 
 @pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])

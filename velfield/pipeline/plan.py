@@ -25,6 +25,8 @@ from velfield.sources.telemetry.find import find_beside
 
 _MANY_GAPS = 0.3
 """Fraction of frames without a near one before them from which a warning is given."""
+_NAMED = 3
+"""Names of files that a message lists."""
 _LATE = 1.5
 """A frame may come late by half an interval."""
 OPTIONAL_INPUTS = tuple(name for name in Inputs.model_fields if name != "source")
@@ -116,11 +118,29 @@ def check_inputs(job: Job) -> None:
     Raises
     ------
     InputError
-        The source cannot be opened, or another input does not exist.
+        The source cannot be opened, another input does not exist, or the folder is not for a run (`check_folder`).
     """
-    check_format(Path(job.root))
+    check_folder(Path(job.root))
     check_source(job.inputs.source)
     _check_optional_inputs(job)
+
+
+def check_folder(root: Path) -> None:
+    """See that results can be written into a folder: it is a run's of this format, empty, not there, or on S3.
+
+    Raises
+    ------
+    InputError
+        It holds a run of another format, or other things, among which results would be written.
+    """
+    check_format(root)
+    found = RunLayout(root).foreign_names()
+    if found:
+        more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        raise InputError(
+            f"{root} is not empty and no run folder: it holds {', '.join(found[:_NAMED])}{more}; give another --out, "
+            "or move these away"
+        )
 
 
 def _check_optional_inputs(job: Job) -> None:
@@ -139,7 +159,7 @@ def make_plan(job: Job) -> Plan:
         The source cannot be read, has no times, or fewer than three frames are left; or the folder holds another
         flight.
     """
-    check_format(Path(job.root))
+    check_folder(Path(job.root))
     job = _with_telemetry(job)
     _check_optional_inputs(job)  # `probe` checks the source
     timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
@@ -269,14 +289,15 @@ def write_clips(root: Path, clips: Sequence[Path]) -> Path:
     Raises
     ------
     InputError
-        The folder is on S3 or holds another flight, or a clip cannot be in a list.
+        The folder is on S3, holds another flight or other things, or a clip cannot be in a list.
     """
     if is_remote(to_path(root)):
         raise InputError(
             f"{root}: several clips need a list on a local disk; write their paths, one per line, into "
             f"clips{CLIPS_SUFFIX} and run that file"
         )
-    path = root / f"source{CLIPS_SUFFIX}"
+    check_folder(root)
+    path = RunLayout(root).clips
     before = set[Path]()
     if RunLayout(root).flight.exists():
         with suppress(InputError, FileNotFoundError):  # of one file, or of clips that are gone

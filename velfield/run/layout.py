@@ -112,6 +112,7 @@ class _Inside:
 
     def __init__(self, path: str) -> None:
         self._path = path
+        self.top = path.partition("/")[0]
 
     def __get__(self, layout: "RunLayout", owner: type) -> Path:
         return layout.root / self._path
@@ -200,6 +201,8 @@ class RunLayout:
     commits = _Inside("commits")
     preview = _Inside(".preview")
     """Run folder of a map made before the run is through, while it is being made (`velfield.pipeline.preview`)."""
+    clips = _Inside("source.clips")
+    """List of several clips, the source of their run."""
     lock = _Inside(".lock")
 
     def __post_init__(self) -> None:
@@ -215,6 +218,17 @@ class RunLayout:
         'RUN/detections/unit-00003.parquet'
         """
         return folder / f"unit-{unit:05d}.parquet"
+
+    def foreign_names(self) -> list[str]:
+        """Names in a local folder that `velfield run` did not make, sorted; none where it is a run's, or not there.
+
+        Hidden files are not among them: they are a system's, or of a run that ended before it wrote ``flight.json``.
+        """
+        if is_remote(self.root) or not self.root.is_dir() or self.flight.exists():
+            return []
+        own = {inside.top for inside in vars(type(self)).values() if isinstance(inside, _Inside)}
+        names = (path.name for path in self.root.iterdir())
+        return sorted(name for name in names if name not in own and not name.startswith("."))
 
     @staticmethod
     def unit_files(folder: Path) -> list[Path]:

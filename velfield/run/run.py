@@ -134,6 +134,11 @@ class Run:
         """Raw pixels of a frame -> base pixels, (n, 2) -> (n, 2).
 
         NaN rows where the frame is not registered, or no control points support the map (`position_sd_px`).
+
+        Raises
+        ------
+        ValueError
+            The points are not (n, 2).
         """
         xy = self._transform_points("to_base", frame, xy_raw)
         xy[np.isnan(self.position_sd_px(frame, xy_raw))] = np.nan
@@ -143,6 +148,11 @@ class Run:
         """Base pixels -> raw pixels of a frame, (n, 2) -> (n, 2).
 
         NaN rows where there is no such pixel, or no control points support the map (`position_sd_px`).
+
+        Raises
+        ------
+        ValueError
+            The points are not (n, 2).
         """
         xy = self._transform_points("to_raw", frame, xy_base)
         xy[np.isnan(self.position_sd_px(frame, xy))] = np.nan
@@ -173,17 +183,17 @@ class Run:
         InputError
             The ground sample distance is not known.
         """
-        return np.asarray(xy_base, np.float64).reshape(-1, 2) * self.gsd_m
+        return _points(xy_base) * self.gsd_m
 
     def position_sd_px(self, frame: int, xy_raw: Points) -> FloatArray:
         """Standard deviation of the base position of a frame's raw pixels, (n, 2) -> (n,) base px.
 
         NaN where the frame is not registered, and where no control points support its map: nothing is detected there.
         """
-        return self.frame_transforms.position_sd_px(frame, np.asarray(xy_raw, np.float64).reshape(-1, 2))
+        return self.frame_transforms.position_sd_px(frame, _points(xy_raw))
 
     def _transform_points(self, direction: str, frame: int, xy: Points) -> Points:
-        points = np.asarray(xy, np.float64).reshape(-1, 2)
+        points = _points(xy)
         transform = self.frame_transforms.transform(frame)
         if transform is None:
             return np.full_like(points, np.nan)
@@ -320,3 +330,17 @@ class Run:
     def base_image(self) -> GreyImage:
         """The base image, (y, x) grey uint8."""
         return read_base_image(self.layout, self.record.config.frames)
+
+
+def _points(xy: Points) -> Points:
+    """Points as (n, 2); a single one may be (2,).
+
+    Raises
+    ------
+    ValueError
+        They have another shape.
+    """
+    points = np.asarray(xy, np.float64)
+    if points.size and points.shape[-1] != 2:
+        raise ValueError(f"found points of shape {points.shape}, expected (n, 2): x and y of each")
+    return points.reshape(-1, 2)
