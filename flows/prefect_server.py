@@ -27,7 +27,7 @@ def choose_orchestration() -> Orchestration:
     InputError
         The server does not answer.
     """
-    if not _may_name_a_server():
+    if not may_have_settings():
         return Threads()
     spare_proxies()
     check_address()
@@ -41,8 +41,8 @@ def choose_orchestration() -> Orchestration:
     return PrefectFlows()
 
 
-def _may_name_a_server() -> bool:
-    """Whether Prefect's settings, in all places where it reads them, are worth its import."""
+def may_have_settings() -> bool:
+    """Whether the user may have settings of Prefect, in any of the places where it reads them."""
     if "prefect" in sys.modules or any(name in os.environ for name in _NAMING_A_SERVER):
         return True
     profiles = Path(os.environ.get("PREFECT_HOME") or os.path.expanduser("~/.prefect")) / "profiles.toml"

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
+from flows.prefect_server import may_have_settings
 from flows.stopping import end_children, stop_on_signals
 from velfield.errors import InputError, count_text
 from velfield.pipeline.watch import FolderWatcher, is_flight, is_telemetry
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 FLIGHT_ARRIVED = "velfield.flight.arrived"
 BASE_IMAGE_ARRIVED = "velfield.base-image.arrived"
 NIGHTLY = "0 3 * * *"
+_DATABASE = "PREFECT_API_DATABASE_CONNECTION_URL"
+_CHOOSING_A_DATABASE = ("PREFECT_HOME", _DATABASE, "PREFECT_SERVER_DATABASE_CONNECTION_URL")
 _POLL_INTERVAL_S = 1.0
 _START_S = 180.0
 _STOP_S = 10.0
@@ -45,7 +48,8 @@ class ServeConfig:
     host: str = "127.0.0.1"
     port: int = 4200
     database: str | None = None
-    """SQLAlchemy address of a Postgres database, ``postgresql+asyncpg://...``; none: SQLite in Prefect's home."""
+    """SQLAlchemy address of a Postgres database, ``postgresql+asyncpg://...``; none: SQLite in the folder, so that the
+    UI lists this folder's runs alone, or what settings of Prefect that the user has say."""
     auth: str | None = None
     """``user:password`` that the API and the UI ask for."""
     nightly: str = NIGHTLY
@@ -114,7 +118,9 @@ def settings(config: ServeConfig) -> dict[str, str]:
         "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED": "true",
     }
     if config.database:
-        given["PREFECT_API_DATABASE_CONNECTION_URL"] = config.database
+        given[_DATABASE] = config.database
+    elif not any(name in os.environ for name in _CHOOSING_A_DATABASE) and not may_have_settings():
+        given[_DATABASE] = f"sqlite+aiosqlite:///{config.folder / 'prefect.db'}"
     if config.auth:
         given |= {"PREFECT_SERVER_API_AUTH_STRING": config.auth, "PREFECT_API_AUTH_STRING": config.auth}
     return given

@@ -199,7 +199,9 @@ def _prepare(verbosity: "Verbosity") -> "Console":
 
 def _announce(job: Job, console: "Console") -> None:
     """The first line, before imports and inputs take their seconds."""
-    console.event("open", f"velfield {version('velfield')}: {job.inputs.source} into {job.root}")
+    console.event(
+        "open", f"velfield {version('velfield')}: {job.inputs.source} into {job.root}, preset {job.config.preset}"
+    )
 
 
 def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity") -> int:

@@ -31,7 +31,7 @@ def serve(
     port
         Port of the server and its UI.
     database
-        `postgresql+asyncpg://...`. Default: SQLite.
+        `postgresql+asyncpg://...`. Default: SQLite in FOLDER.
     auth
         USER:PASSWORD required by the server.
     nightly

@@ -174,7 +174,7 @@ def test_prefect_is_asked_only_where_its_settings_may_name_a_server(
     monkeypatch.delitem(sys.modules, "prefect", raising=False)
     monkeypatch.setenv("PREFECT_HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
-    assert prefect_server._may_name_a_server() == asked
+    assert prefect_server.may_have_settings() == asked
 
 
 def test_prefect_is_not_imported_where_nothing_may_name_a_server(

@@ -81,6 +81,32 @@ def test_no_analytics_and_no_other_origin() -> None:
 
 
 @pytest.mark.parametrize(
+    ("chosen", "expected"),
+    [
+        ({}, "sqlite+aiosqlite:////flights/prefect.db"),
+        ({"PREFECT_HOME": "/elsewhere"}, None),
+        ({"PREFECT_SERVER_DATABASE_CONNECTION_URL": "sqlite+aiosqlite:////elsewhere/runs.db"}, None),
+        ({"PREFECT_PROFILE": "mine"}, None),
+    ],
+)
+def test_a_folder_has_a_database_of_its_own_unless_the_user_has_chosen_one(
+    chosen: dict[str, str], expected: str | None, tmp_path: Path
+) -> None:
+    """In a process without Prefect: its settings are read once, when it is imported."""
+    ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    code = (
+        "import sys; from pathlib import Path; from flows.serve import ServeConfig, settings; "
+        "print(settings(ServeConfig(Path('/flights'))).get('PREFECT_API_DATABASE_CONNECTION_URL')); "
+        "assert 'prefect' not in sys.modules"
+    )
+    environment = {**ours, "HOME": str(tmp_path), "PYTHONPATH": str(ROOT), **chosen}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == str(expected)
+
+
+@pytest.mark.parametrize(
     ("host", "url"),
     [("0.0.0.0", "http://127.0.0.1:4321"), ("::", "http://[::1]:4321"), ("10.0.0.1", "http://10.0.0.1:4321")],
 )
@@ -123,8 +149,18 @@ def test_all_addresses_with_a_password(tmp_path: Path) -> None:
     """A real server: without the password nothing but its health, and the UI works under other names of the machine."""
     port = free_port()
     ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
-    environment = {**ours, "PREFECT_HOME": str(tmp_path / "home"), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "flows.cli", "serve", str(tmp_path), "--host", "0.0.0.0", "--port", str(port)]
+    environment = {**ours, "HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    command = [
+        sys.executable,
+        "-m",
+        "flows.cli",
+        "serve",
+        str(tmp_path / "served"),
+        "--host",
+        "0.0.0.0",
+        "--port",
+        str(port),
+    ]
     errors = (tmp_path / "errors").open("w+")
     with (
         errors,
@@ -136,6 +172,7 @@ def test_all_addresses_with_a_password(tmp_path: Path) -> None:
             assert process.stdout is not None
             told = process.stdout.readline().strip()
             assert told == f"Prefect UI  http://127.0.0.1:{port}, port {port} of all its addresses"
+            assert (tmp_path / "served" / "prefect.db").exists()
             url = f"http://localhost:{port}"
             for password, status in ((None, 401), ("somebody:else", 401), (AUTH, 200)):
                 request = urllib.request.Request(

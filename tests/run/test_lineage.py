@@ -1,6 +1,7 @@
 """Lineage: the tracks behind a pixel are exactly those that the field counts there."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,10 @@ def test_a_run_converts_to_metres_where_its_scale_is_known(whole: tuple[Path, Ru
     run = open_run(whole[0])
     assert run.gsd_m == run.grid.gsd_m
     np.testing.assert_allclose(run.to_metres([[0, 0], [412, 300]]), [[0, 0], [412 * run.gsd_m, 300 * run.gsd_m]])
+    assert run.to_metres([2, 0]).shape == run.to_base(0, [100, 100]).shape == (1, 2)
+    for ask in (run.to_metres, partial(run.to_base, 0), partial(run.to_raw, 0), partial(run.position_sd_px, 0)):
+        with pytest.raises(ValueError, match=r"^found points of shape \(3,\), expected \(n, 2\): x and y of each$"):
+            ask([1, 2, 3])
     vars(run)["grid"] = run.grid.model_copy(update={"gsd_m": None})
     for ask in (lambda: run.gsd_m, lambda: run.to_metres([[1, 2]])):
         with pytest.raises(InputError, match=r"no scale.*--gsd-m"):
