@@ -222,13 +222,16 @@ class RunLayout:
     def foreign_names(self) -> list[str]:
         """Names in a local folder that `velfield run` did not make, sorted; none where it is a run's, or not there.
 
-        Hidden files are not among them: they are a system's, or of a run that ended before it wrote ``flight.json``.
+        Hidden and partial files are not among them: they are a system's, or of a run that ended before it wrote
+        ``flight.json``.
         """
         if is_remote(self.root) or not self.root.is_dir() or self.flight.exists():
             return []
         own = {inside.top for inside in vars(type(self)).values() if isinstance(inside, _Inside)}
         names = (path.name for path in self.root.iterdir())
-        return sorted(name for name in names if name not in own and not name.startswith("."))
+        return sorted(
+            name for name in names if name not in own and not name.startswith(".") and not name.endswith(".partial")
+        )
 
     @staticmethod
     def unit_files(folder: Path) -> list[Path]:
