@@ -70,6 +70,7 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
         (["trackin.max_speed_m_per_s=20"], "unknown key 'trackin'; did you mean 'tracking'?"),
         (["max_turn=20"], "did you mean 'tracking.max_turn_rad'"),
         (["frames.evry=2"], "did you mean 'frames.every'"),
+        (["tracking.=3"], "unknown key 'tracking.'; `velfield schema` lists the keys"),
         (["gsd=0.2"], "did you mean 'gsd_m'"),
         (["tracking.foo=3"], "unknown key 'tracking.foo'; `velfield schema` lists the keys"),
         (["tracking.max_speed_m_per_s=.nan"], "finite"),

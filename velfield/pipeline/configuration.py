@@ -262,7 +262,7 @@ def _did_you_mean(key: str) -> str:
     def similarity(name: str) -> tuple[float, float]:
         other = name.rpartition(".")[2]
         # Beginnings count, as `max_sped` of `max_speed_m_per_s`: people leave out the unit.
-        begin = _ratio(last, other[: len(last)]) if other.startswith(last[:3]) else 0.0
+        begin = _ratio(last, other[: len(last)]) if last and other.startswith(last[:3]) else 0.0
         return max(begin, _ratio(last, other)), _ratio(key, name)
 
     for candidates in ([name for name in names if name.rpartition(".")[0] == section], names):
