@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from flows import cli
+from flows.commands.run import _announce
 from flows.console import Console
+from schemas.job import Job
 from schemas.simulation import SimulationConfig
 from tests.small_flight import job
 from velfield.errors import InputError
@@ -133,6 +135,18 @@ def test_no_credentials_for_an_object_store_are_one_line(tmp_path: Path) -> None
     lines = ended.stderr.splitlines()
     assert (ended.returncode, len(lines)) == (1, 1), lines
     assert lines[0].startswith("velfield: S3: no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_")
+
+
+def test_the_first_line_says_the_preset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`velfield demo` chooses `fast`, whose results are not those of the default."""
+    jobs: list[Job] = []
+    monkeypatch.setattr("flows.commands.simulate.write_simulation", lambda *_, **__: None)
+    monkeypatch.setattr("flows.commands.run.process", lambda job, **_: jobs.append(job) or 1)
+    command(monkeypatch, capsys, "demo", "--out", str(tmp_path))
+    _announce(jobs[0], Console())
+    assert capsys.readouterr().err.endswith("DJI_0001.MP4 into " + str(tmp_path / "run") + ", preset fast\n")
 
 
 @pytest.mark.parametrize("option", ["base", "labels"])
