@@ -74,7 +74,7 @@ def test_the_head_of_a_queue_that_another_joins_is_stopped() -> None:
     made = Flight()
     made.add(1, np.minimum(20 + 1.0 * np.arange(30), 40.0), 50.0)  # comes up, and stops at 40 m
     for k, x_m in enumerate((47.0, 55.0, 62.0)):
-        made.add(2 + k, standing(x_m, 30), 50.3, 0.05)
+        made.add(2 + k, standing(x_m, 30 - k), 50.3, 0.05)  # missed in the last frames
         made.add(12 + k, standing(x_m, 30), 52.6, 0.05)
     made.add(5, standing(76.0, 30), 50.0)  # beyond a gap
     made.add(6, standing(33.0, 30), 54.0)  # behind it

@@ -28,6 +28,8 @@ _QUEUE_M = (2.5, 10.0)
 """Least and largest distance between the middles of two vehicles of a queue: two bicycles; a car behind a bus."""
 _QUEUE_RAD = np.radians(20)
 """Their axes differ by less."""
+_QUEUE_S = 1.0
+"""Neither is missed for longer at the time when the other is seen."""
 _DRIVEN_FRACTION = 0.4
 """Minimum fraction of that length that others drove, for a stationary vehicle to be in a lane."""
 
@@ -159,7 +161,8 @@ class _Standing:
             along, across = (step * u).sum(1), np.abs(step[:, 0] * u[:, 1] - step[:, 1] * u[:, 0])
             joined = (along > _QUEUE_M[0]) & (across < _HALF_WIDTH_M) & ~found[ahead]
             joined &= (u * course[behind]).sum(1) > np.cos(_QUEUE_RAD)
-            joined &= (self.seen_s[ahead, 0] <= time_s[behind]) & (time_s[behind] <= self.seen_s[ahead, 1])
+            joined &= self.seen_s[ahead, 0] <= time_s[behind] + _QUEUE_S
+            joined &= time_s[behind] - _QUEUE_S <= self.seen_s[ahead, 1]
             ahead, first = np.unique(ahead[joined], return_index=True)
             found[ahead] = True
             xy_m, course, time_s = self.xy_m[ahead], u[joined][first], time_s[behind[joined][first]]
