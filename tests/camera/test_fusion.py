@@ -9,6 +9,7 @@ from velfield.camera.frame_pairs import FramePairs, ScaledLens
 from velfield.camera.fusion import MAX_RESIDUAL, refine_lens
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
 from velfield.camera.multiview import MultiViewFit
+from velfield.camera.plumbline import pinhole_record
 from velfield.pipeline.stages.lens import _notes
 
 SHAPE = (480, 640)
@@ -69,6 +70,8 @@ def test_estimates_that_agree_are_fused_by_inverse_variance(monkeypatch: pytest.
     assert refined.reason.startswith("plumb line; then multi-view a = 0.220 +- 0.010 from 9 pairs of 6 frames")
     (note,) = _notes(refined)
     assert note == "the lens distortion was refined by frames that show the same ground at different places"
+    never = "lens.calibrate is never: pinhole model used"
+    assert _notes(pinhole_record((480, 640), never)) == [never]
     assert families[0].lens(np.array([0.2, 0.0, 0.0])) == lens_from_record(record(0.2).lens)
 
 

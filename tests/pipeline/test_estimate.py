@@ -122,6 +122,7 @@ def test_an_empty_folder_and_one_of_a_run_that_ended_early_are_taken(flight: Pat
     write_flight_record(make_plan(work))
     (layout.root / "notes.txt").touch()  # among the results of a run
     make_plan(work)
+    assert layout.foreign_names() == []
 
 
 @pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])

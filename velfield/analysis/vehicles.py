@@ -154,9 +154,8 @@ class _Standing:
             return found
         tree = cKDTree(self.xy_m)
         while len(xy_m):
-            near = [tree.query_ball_point(one, _QUEUE_M[1]) for one in xy_m]
-            behind = np.repeat(np.arange(len(xy_m)), [len(rows) for rows in near])
-            ahead = np.array([row for rows in near for row in rows], np.int64)
+            near = cKDTree(xy_m).sparse_distance_matrix(tree, _QUEUE_M[1], output_type="ndarray")
+            behind, ahead = near["i"], near["j"]
             step, u = self.xy_m[ahead] - xy_m[behind], _along(self.axis_rad[ahead], course[behind])
             along, across = (step * u).sum(1), np.abs(step[:, 0] * u[:, 1] - step[:, 1] * u[:, 0])
             joined = (along > _QUEUE_M[0]) & (across < _HALF_WIDTH_M) & ~found[ahead]

@@ -53,9 +53,9 @@ class Lane:
         step = np.gradient(self.xy_m, axis=0)
         return np.asarray(np.arctan2(step[:, 1], step[:, 0]))
 
-    def at(self, along_m: float) -> FloatArray:
-        """(2,) position at a distance along the centre line."""
-        return np.array([np.interp(along_m, self.along_m, self.xy_m[:, k]) for k in (0, 1)])
+    def at(self, along_m: float | FloatArray) -> FloatArray:
+        """(2,) position at a distance along the centre line, (n, 2) at distances (n,)."""
+        return np.stack([np.interp(along_m, self.along_m, self.xy_m[:, k]) for k in (0, 1)], axis=-1)
 
 
 @dataclass(frozen=True)

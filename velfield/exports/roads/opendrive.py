@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import BPoly
 
 from schemas.arrays import FloatArray, Points
 from schemas.export import ExportOptions
@@ -110,8 +111,7 @@ def _connecting_line(before: Points, after: Points) -> Points:
         return np.stack([a, b])
     ways = before[-1] - before[-2], after[1] - after[0]
     u, v = (way / max(float(np.hypot(*way)), 1e-9) * length / 3 for way in ways)
-    t = np.linspace(0, 1, _PIECES + 1)[:, None]
-    return np.asarray((1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * (a + u) + 3 * (1 - t) * t**2 * (b - v) + t**3 * b)
+    return np.asarray(BPoly(np.stack([a, a + u, b - v, b])[:, None], [0, 1])(np.linspace(0, 1, _PIECES + 1)))
 
 
 def _road(

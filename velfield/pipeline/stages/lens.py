@@ -80,6 +80,8 @@ def _warnings(plan: Plan, record: CameraRecord) -> list[str]:
 
 def _notes(record: CameraRecord) -> list[str]:
     """What was decided, for people; the figures that decided it are in ``camera.json``."""
+    if not record.accepted and not record.frames:
+        return [record.reason]  # not asked for
     if not record.accepted:
         return ["no lens distortion is certain enough to correct: the frames are used as recorded"]
     if record.overlap is not None and record.overlap.used:

@@ -121,7 +121,7 @@ def place_labels(analysis: TrafficAnalysis, picture: GreyImage | None) -> MapLab
     lanes = [lane for lane in analysis.lanes if lane.length_m >= _ARROW_PT * m_per_pt]
     boxes = _Boxes(m_per_pt)
     spots = [_spots(lane, _ARROW_PT * m_per_pt, _STEP_PT * m_per_pt) for lane in lanes]
-    points = np.concatenate([np.empty((0, 2)), *(lane_at(lane, at) for lane, at in zip(lanes, spots, strict=True))])
+    points = np.concatenate([np.empty((0, 2)), *(lane.at(at) for lane, at in zip(lanes, spots, strict=True))])
     owner = np.repeat(np.arange(len(lanes)), [len(at) for at in spots])
     free = np.ones(len(points), bool)
 
@@ -146,10 +146,10 @@ def place_labels(analysis: TrafficAnalysis, picture: GreyImage | None) -> MapLab
         boxes.add(boxes.of(text, size, best, pad))
         return Label(text, best, of_m, size)
 
-    minor = {j.number: analysis.junction_kind(j.number) in ("merge", "diverge") for j in analysis.lanes.junctions}
+    sizes = _junction_sizes(analysis)
     junctions = [
-        stand(f"J{j.number}", _MERGE_SIZE if minor[j.number] else _JUNCTION_SIZE, j.centre_m, 0.3)
-        for j in sorted(analysis.lanes.junctions, key=lambda j: minor[j.number])
+        stand(f"J{j.number}", sizes[j.number], j.centre_m, 0.3)
+        for j in sorted(analysis.lanes.junctions, key=lambda j: -sizes[j.number])
     ]
     arms = [stand(arm.name, _ARM_SIZE, arm.xy_m, 0.1) for arm in (analysis.scene.arms if analysis.scene else ())]
     arrows = np.empty((0, 2, 2))
@@ -161,7 +161,7 @@ def place_labels(analysis: TrafficAnalysis, picture: GreyImage | None) -> MapLab
         away = np.hypot(*(xy[:, None] - arrows.mean(axis=1)[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
         along = at[np.argmax(np.minimum(away, _APART_PT * m_per_pt))]
         half = _ARROW_PT * m_per_pt / 2
-        arrow = lane_at(lanes[k], np.array([along - half, along + half]))
+        arrow = lanes[k].at(np.array([along - half, along + half]))
         arrows = np.concatenate([arrows, arrow[None]])
         boxes.add(np.hstack([arrow.mean(axis=0) - half, arrow.mean(axis=0) + half]))
     numbers = _numbers(analysis, boxes)
@@ -179,7 +179,7 @@ def _numbers(analysis: TrafficAnalysis, boxes: _Boxes) -> list[Label]:
     for lane in sorted(analysis.lanes, key=lambda lane: (lane.length_m < _LONG_M, lane.length_m)):
         reach = reach_m[lane.number]
         further = np.arange(0, lane.length_m, 2 * _STEP_PT * boxes.m_per_pt)
-        places = lane_at(lane, np.r_[np.array(_NUMBER_AT) * reach, further[further < reach], further])
+        places = lane.at(np.r_[np.array(_NUMBER_AT) * reach, further[further < reach], further])
         free = boxes.free(boxes.of(str(lane.number), _NUMBER_SIZE, places, 0.15))
         if free.any():
             xy = places[int(np.argmax(free))]
@@ -195,11 +195,6 @@ def _spots(lane: Lane, arrow_m: float, step_m: float) -> FloatArray:
     every = np.arange(low, high, step_m)
     every = every[np.argsort(np.abs(every - lane.length_m / 2), kind="stable")]
     return np.asarray(np.r_[np.clip(np.array([0.5, 0.75, 0.25]) * lane.length_m, low, high), every])
-
-
-def lane_at(lane: Lane, along_m: FloatArray) -> FloatArray:
-    """(n, 2) positions at distances (n,) along a lane."""
-    return np.column_stack([np.interp(along_m, lane.along_m, lane.xy_m[:, k]) for k in (0, 1)])
 
 
 def place_caption(analysis: TrafficAnalysis, labels: MapLabels) -> str:
@@ -255,12 +250,19 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
 
 def draw_junctions_aside(axes: "Axes", analysis: TrafficAnalysis) -> None:
     """Numbers of the junctions beside them, with lines to them: what lies in the junctions stays visible."""
-    minor = {j.number: analysis.junction_kind(j.number) in ("merge", "diverge") for j in analysis.lanes.junctions}
+    sizes = _junction_sizes(analysis)
     labels = [
-        Label(f"J{j.number}", j.centre_m + _ASIDE_M, j.centre_m, _MERGE_SIZE if minor[j.number] else _JUNCTION_SIZE)
-        for j in analysis.lanes.junctions
+        Label(f"J{j.number}", j.centre_m + _ASIDE_M, j.centre_m, sizes[j.number]) for j in analysis.lanes.junctions
     ]
     _draw_junctions(axes, analysis, labels)
+
+
+def _junction_sizes(analysis: TrafficAnalysis) -> dict[int, float]:
+    """Font size of each junction's number, pt: small where lanes only merge or part."""
+    return {
+        j.number: _MERGE_SIZE if analysis.junction_kind(j.number) in ("merge", "diverge") else _JUNCTION_SIZE
+        for j in analysis.lanes.junctions
+    }
 
 
 def _draw_junctions(axes: "Axes", analysis: TrafficAnalysis, labels: Sequence[Label]) -> None:
@@ -289,7 +291,7 @@ def _draw_scale(axes: "Axes") -> None:
     power = 10.0 ** np.floor(np.log10(longest))
     length = power * max(step for step in (1, 2, 5) if step * power <= longest)
     x, y = left + 0.03 * (right - left), bottom + 0.04 * (top - bottom)
-    axes.plot([x, x + length], [y, y], color="#1b1f24", linewidth=3, solid_capstyle="butt")
+    axes.plot([x, x + length], [y, y], color=_INK, linewidth=3, solid_capstyle="butt")
     above = y + 0.02 * (top - bottom)
     axes.text(x + length / 2, above, f"{length:g} m", ha="center", va="bottom", fontsize=7, bbox=_PALE_BOX)
 
@@ -302,6 +304,6 @@ def _draw_north(axes: "Axes", north_rad: float | None) -> None:
     size = 0.05 * (right - left)
     at = np.array([right - 1.5 * size, top + np.sign(bottom - top) * 1.5 * size])
     tip = at + size * np.array([np.cos(north_rad), np.sin(north_rad)])
-    style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 14}
+    style = {"arrowstyle": "-|>", "color": _INK, "mutation_scale": 14}
     axes.annotate("N", xy=(tip[0], tip[1]), xytext=(at[0], at[1]), ha="center", va="center", fontsize=8,
                   arrowprops=style, bbox=_PALE_BOX)  # fmt: skip

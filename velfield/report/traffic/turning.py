@@ -52,6 +52,7 @@ def arm_directions(arms: tuple[Arm, ...], centre_m: FloatArray) -> dict[str, flo
 def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
     """The turning-movement diagram of a junction."""
     from matplotlib.patches import Polygon
+    from scipy.interpolate import BPoly
 
     angle = arm_directions(found.gates.arms, found.junction.centre_m)
     most = max(m.seen + m.inferred for m in found.movements)
@@ -63,7 +64,8 @@ def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
             out, out_aside = _axes_of(angle[m.arm_out])
             begin = -aside * (_FROM + _FROM_STEP * rank)
             end = out_aside * (_TO + _TO_STEP * _movements(found, arm_out=m.arm_out).index(m))
-            line = _bezier(outward + begin, 0.25 * outward + begin, 0.25 * out + end, out + end)
+            bent = np.stack([outward + begin, 0.25 * outward + begin, 0.25 * out + end, out + end])
+            line = BPoly(bent[:, None], [0, 1])(np.linspace(0, 1, 60))
             half = _THIN + (_THICK - _THIN) * (m.seen + m.inferred) / most
             axes.add_patch(Polygon(_arrow(line, half), facecolor=tone, alpha=0.8, edgecolor="none"))
         side = "left" if outward[0] > 0.3 else "right" if outward[0] < -0.3 else "center"
@@ -113,11 +115,6 @@ def _vertical_range(found: JunctionMovements) -> tuple[float, float]:
         ends.append(down - 0.3 * abs(np.cos(angle[arm.name])))  # arrows lie to both sides of an arm
         ends.append(down + 0.3 * abs(np.cos(angle[arm.name])))
     return min(ends) - _MARGIN, max(ends) + _MARGIN
-
-
-def _bezier(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-    t = np.linspace(0, 1, 60)[:, None]
-    return np.asarray((1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d)
 
 
 def _arrow(line: FloatArray, half: float) -> FloatArray:
