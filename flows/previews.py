@@ -11,7 +11,7 @@ from typing import Any
 
 from flows.console import Console
 from flows.runners import Runner
-from flows.work import UnderWay, is_long
+from flows.work import UnderWay
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
@@ -56,7 +56,7 @@ class Previews:
             return None
         if not self._first_tried:
             self._first_tried = True
-            if is_long(self.plan) and not self.plan.layout.report.exists():
+            if self.plan.is_long and not self.plan.layout.report.exists():
                 return lambda: self._make(self._show_first_frames)
         found = next((stage for stage in stages if stage.stage.name == "detections"), None)
         if found is None or not self._is_worth_it(found):

@@ -23,15 +23,8 @@ from velfield.run.commits import WHOLE, read_commits
 
 GraphOf = Callable[[Plan, Stage, Unit], Any]
 """The Dask graph of a unit."""
-LONG_MPX = 1200.0
-"""Frames times megapixels of a long flight: two minutes of two processors."""
 _QUEUED = 1
 """Units submitted beyond those that run, so that a thread that is done finds the next one."""
-
-
-def is_long(plan: Plan) -> bool:
-    """Whether a flight takes so long that previews, and seconds that save memory, are worth it."""
-    return plan.frame_count * plan.info.width * plan.info.height / 1e6 >= LONG_MPX
 
 
 @dataclass
@@ -154,7 +147,7 @@ class Work:
 
     def _restart_before(self, stage: Stage) -> None:
         """Restart the workers of a long flight before a stage that takes much memory."""
-        if not (stage.new_workers and is_long(self.plan)):
+        if not (stage.new_workers and self.plan.is_long):
             return
         units = stage_units(self.plan, stage)
         if any(committed(self.plan, stage.name, unit.name) is None for unit in units):

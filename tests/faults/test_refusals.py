@@ -204,7 +204,7 @@ def test_a_wrong_base_image_is_refused_before_a_frame_is_stored(
     """Long flights only: the base stage of a short one comes soon enough."""
     checked: list[object] = []
     plans = {name: make_plan(job(flight, tmp_path / "run", base=str(path))) for name, path in bases.items()}
-    monkeypatch.setattr(check_inputs, "_LONG_PX", 1)
+    monkeypatch.setattr("velfield.pipeline.plan.LONG_MPX", 0.0)
     given_files.check_base_area(make_plan(job(flight, tmp_path / "run")))
     given_files.check_base_area(plans["turned"])
     for name, found in {"mirrored": "found a mirrored image", "town": _ELSEWHERE, "noise": _ELSEWHERE}.items():
@@ -212,7 +212,7 @@ def test_a_wrong_base_image_is_refused_before_a_frame_is_stored(
             check_inputs.validate_inputs(plans[name])
         assert "\n" not in str(caught.value)
     monkeypatch.setattr(given_files, "check_base_area", checked.append)
-    monkeypatch.setattr(check_inputs, "_LONG_PX", 10**9)
+    monkeypatch.setattr("velfield.pipeline.plan.LONG_MPX", 1e9)
     check_inputs.validate_inputs(plans["mirrored"])
     assert checked == []
 
@@ -220,7 +220,7 @@ def test_a_wrong_base_image_is_refused_before_a_frame_is_stored(
 def test_a_wrong_base_image_of_a_short_flight_is_refused_before_a_frame_is_registered(
     flight: Path, bases: dict[str, Path], tmp_path: Path
 ) -> None:
-    """Its frames are stored by then, which takes less time than the check."""
+    """Its frames are stored by then."""
     plan = make_plan(job(flight, tmp_path / "run", base=str(bases["town"])))
     write_flight_record(plan)
     with pytest.raises(InputError, match=rf"--base .*town\.png: {_ELSEWHERE}") as caught:

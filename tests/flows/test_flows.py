@@ -138,7 +138,7 @@ def test_workers_give_the_same_bits(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Workers of a long flight, which are restarted on the way; previews have a test of their own."""
-    monkeypatch.setattr("flows.work.LONG_MPX", 0.0)
+    monkeypatch.setattr("velfield.pipeline.plan.LONG_MPX", 0.0)
     monkeypatch.setattr("flows.process_flight.Previews", lambda *_: None)
     restarted, true = [], ClientRunner.restart_workers
     monkeypatch.setattr(ClientRunner, "restart_workers", lambda self: restarted.append(true(self)))

@@ -50,7 +50,7 @@ class Recording(Console):
 
 @pytest.fixture
 def _always(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flows.work.LONG_MPX", 0.0)
+    monkeypatch.setattr("velfield.pipeline.plan.LONG_MPX", 0.0)
     for name in ("WORTH_S", "TIMES_ITS_COST"):
         monkeypatch.setattr(f"flows.previews.{name}", 0.0)
     monkeypatch.setattr("flows.previews.SHARE", 1.0)

@@ -8,9 +8,6 @@ from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut
 from velfield.run.commits import WHOLE
 
-_LONG_PX = 50_000_000
-"""Pixels of all frames above which decoding them takes longer than the check of the base image."""
-
 
 def validate_inputs(plan: Plan) -> None:
     """Read each file that a stage has yet to read; see that the device is there.
@@ -35,8 +32,7 @@ def validate_inputs(plan: Plan) -> None:
             given_files.READ_GIVEN[option](Path(getattr(plan.job.inputs, option)), plan)
         except InputError as error:
             raise InputError(f"--{option}: {error}") from None
-    is_far_off = plan.frame_count * plan.info.width * plan.info.height > _LONG_PX  # the stage that checks it too
-    if "base" in pending and is_far_off:
+    if "base" in pending and plan.is_long:  # of a short flight the stage that registers it comes soon enough
         given_files.check_base_area(plan)
 
 

@@ -29,6 +29,8 @@ _NAMED = 3
 """Names of files that a message lists."""
 _LATE = 1.5
 """A frame may come late by half an interval."""
+LONG_MPX = 1200.0
+"""Frames times megapixels of a long flight: two minutes of two processors."""
 OPTIONAL_INPUTS = tuple(name for name in Inputs.model_fields if name != "source")
 _ONE_UNIT = 16
 """Up to so many frames are one unit."""
@@ -65,6 +67,11 @@ class Plan:
     @property
     def frame_count(self) -> int:
         return len(self.indices)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether a flight takes so long that previews, early checks, and seconds that save memory are worth it."""
+        return self.frame_count * self.info.width * self.info.height / 1e6 >= LONG_MPX
 
     @property
     def unit_frames(self) -> int:

@@ -4,9 +4,7 @@ The (y, x) layers beside the histogram in ``field.zarr``: computed with the tile
 read the histogram.
 """
 
-from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,10 +88,8 @@ def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dic
 Group = tuple[int, int]
 """(row, column)."""
 
-_WRITES_AT_ONCE = 2
-"""Histograms of a group that are compressed and written while the next one is computed, 22 MB each, nearly all zeros:
-a quarter of the time went into clearing new ones, so those that were written are used again."""
-_writers = ThreadPoolExecutor(2 * _WRITES_AT_ONCE, thread_name_prefix="tiles")
+_KEPT = 2
+"""Histograms of 22 MB that are used again once they are written: clearing new ones took a quarter of the time."""
 
 
 def tile_groups(grid: GridRecord, config: FieldConfig) -> list[Group]:
@@ -122,7 +118,6 @@ class GroupWriter:
         self.y0, self.x0 = group[0] * self.side, group[1] * self.side
         self.height, self.width = min(self.side, grid.height_px - self.y0), min(self.side, grid.width_px - self.x0)
         self.touched: list[tuple[int, int]] = []
-        self._writes: deque[Future[NDArray[np.int32]]] = deque()
         self._zeros = zeros
         self.layers: dict[str, NDArray[Any]] = {
             name: np.full((self.height, self.width), fill_value(layer.dtype), layer.dtype)
@@ -162,8 +157,7 @@ class GroupWriter:
         """
         histograms = [(HISTOGRAM, tile)] + ([] if time_weighted is None else [(HISTOGRAM_TIME_WEIGHTED, time_weighted)])
         if not tile.count.any():
-            for _, one in histograms:
-                self._keep(one.histogram)
+            self._keep(histograms)
             return
         self.touched.append((row, column))
         x, y = self.origin_xy(row, column)
@@ -171,31 +165,21 @@ class GroupWriter:
         window = np.s_[y - self.y0 : y - self.y0 + height, x - self.x0 : x - self.x0 + width]
         for name, values in tile_layers(tile, self.bins, self.config).items():
             self.layers[name][window] = values
-        for name, one in histograms:
-            if len(self._writes) == _WRITES_AT_ONCE:
-                self._keep(self._writes.popleft().result())
-            self._writes.append(_writers.submit(self._write, row, column, one, name))
-
-    def _keep(self, zeros: NDArray[np.int32]) -> None:
-        if len(self._zeros) < _WRITES_AT_ONCE:
-            self._zeros.append(zeros)
-
-    def _write(self, row: int, column: int, tile: FieldTile, name: str) -> NDArray[np.int32]:
-        """Write a histogram, then fill it with zeros."""
         passed = tile.count > 0
         y, x = np.argwhere(passed)[0]
-        if tile.histogram[y, x].any() or tile.histogram[passed].any():  # weights of milliseconds may all be zero
-            self.store.write_tile(row, column, tile.histogram, tile.count, name)
-            tile.histogram[passed] = 0
-        return tile.histogram
+        for name, one in histograms:
+            if one.histogram[y, x].any() or one.histogram[passed].any():  # weights of milliseconds may all be zero
+                self.store.write_tile(row, column, one.histogram, one.count, name)
+                one.histogram[passed] = 0
+        self._keep(histograms)
+
+    def _keep(self, histograms: list[tuple[str, FieldTile]]) -> None:
+        self._zeros += [one.histogram for _, one in histograms[: _KEPT - len(self._zeros)]]
 
     def close(self) -> None:
-        """Wait for the tiles, and write the layers."""
-        while self._writes:
-            self._keep(self._writes.popleft().result())
-        layers = [_writers.submit(self.store.write_layer, name, self.group, one) for name, one in self.layers.items()]
-        for layer in layers:
-            layer.result()
+        """Write the layers."""
+        for name, one in self.layers.items():
+            self.store.write_layer(name, self.group, one)
 
     def files(self) -> list[Path]:
         """The files written, once closed, and the store's metadata."""

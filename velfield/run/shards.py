@@ -37,19 +37,16 @@ def encode_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], tile: in
         (ty, tx); where it is zero the histogram is.
     """
     side = block_side(tile)
-    index = np.full((tile // side, tile // side, 2), _NOT_STORED, "<u8")
-    parts, end = [], 0
-    y, x = np.nonzero(count)
-    passed = np.zeros((tile // side, tile // side), np.bool_)
-    passed[y // side, x // side] = True
-    for row, column in np.argwhere(passed):
-        window = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
-        block = np.ascontiguousarray(histogram[window], "<i4")
-        if block.shape[:2] != (side, side):  # at the map's edge
-            block = np.pad(block, [(0, side - block.shape[0]), (0, side - block.shape[1]), (0, 0), (0, 0)])
-        parts.append(_CODEC.encode(block))
-        index[row, column] = end, len(parts[-1])
-        end += len(parts[-1])
+    blocks = tile // side
+    if count.shape != (tile, tile):  # at the map's edge
+        beyond = [(0, tile - count.shape[0]), (0, tile - count.shape[1])]
+        histogram, count = np.pad(histogram, [*beyond, (0, 0), (0, 0)]), np.pad(count, beyond)
+    passed = count.reshape(blocks, side, blocks, side).any(axis=(1, 3))
+    of_blocks = histogram.reshape(blocks, side, blocks, side, *histogram.shape[2:]).swapaxes(1, 2)
+    parts = [_CODEC.encode(block) for block in of_blocks[passed].astype("<i4", copy=False)]
+    sizes = np.array([len(part) for part in parts], "<u8")
+    index = np.full((blocks, blocks, 2), _NOT_STORED, "<u8")
+    index[passed] = np.column_stack([np.cumsum(sizes) - sizes, sizes])
     index_bytes = index.tobytes()
     return b"".join([*parts, index_bytes, _checksum(index_bytes)])
 

@@ -10,7 +10,7 @@ centre, and the orientation at each of its pixels.
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from math import cos, sin, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import cv2
@@ -271,17 +271,21 @@ def highest_gaussians(vehicles: FloatArray) -> tuple[Float32Array, IntArray]:
     """Heatmap (m, m) of vehicles (n, 4...) as x, y, axis, length, and whose Gaussian each pixel shows; -1: none's."""
     size = len(_HEATMAP_PX)
     heatmap, number = np.zeros((size, size), np.float32), np.full((size, size), -1)
-    for k in _near_patch(vehicles):
-        x, y, angle, length = vehicles[k, :4]
-        column, row = np.rint((vehicles[k, :2] - _HEATMAP_PX[0]) / STRIDE).astype(int)
-        rows, columns = (slice(max(0, at - _HEATMAP_REACH), max(0, at + _HEATMAP_REACH + 1)) for at in (row, column))
-        dx, dy = _HEATMAP_PX[None, columns] - x, _HEATMAP_PX[rows, None] - y
-        c, s, longer = cos(angle), sin(angle), max(np.nan_to_num(length) / USUAL_SIZE_PX[0], 1.0)
-        along, across = (dx * c + dy * s) / sqrt(longer), dy * c - dx * s
-        gaussian = np.exp(-(along * along + across * across) / (2 * HEATMAP_SIGMA_PX**2)).astype(np.float32)
-        nearest = gaussian > heatmap[rows, columns]
-        heatmap[rows, columns][nearest] = gaussian[nearest]
-        number[rows, columns][nearest] = k
+    near = _near_patch(vehicles)
+    first = np.rint((vehicles[near, :2] - _HEATMAP_PX[0]) / STRIDE).astype(int) - _HEATMAP_REACH
+    last = (first + 2 * _HEATMAP_REACH + 1).clip(0).tolist()
+    stretch = np.sqrt(np.fmax(vehicles[near, 3] / USUAL_SIZE_PX[0], 1.0))  # of an unknown length: 1
+    along_xy = np.column_stack([np.cos(vehicles[near, 2]), np.sin(vehicles[near, 2])]) / (sqrt(2) * HEATMAP_SIGMA_PX)
+    for k, (left, top), (right, bottom), (c, s), longer in zip(
+        near.tolist(), first.clip(0).tolist(), last, along_xy.tolist(), stretch.tolist(), strict=True
+    ):
+        dx, dy = _HEATMAP_PX[None, left:right] - vehicles[k, 0], _HEATMAP_PX[top:bottom, None] - vehicles[k, 1]
+        along, across = (dx * c + dy * s) / longer, dy * c - dx * s
+        gaussian = np.exp(-(along * along + across * across)).astype(np.float32)
+        window, numbers = heatmap[top:bottom, left:right], number[top:bottom, left:right]
+        nearest = gaussian > window
+        window[nearest] = gaussian[nearest]
+        numbers[nearest] = k
     return heatmap, number
 
 

@@ -5,34 +5,15 @@ rows of a matrix (im2col) that stays in the second-level cache, and multiplies i
 kernels keep the resolution, a 4 x 4 kernel has stride 2. Beyond an image there are zeros ("same" padding).
 """
 
-import math
-import threading
-from collections.abc import Iterator
-
 import numpy as np
 
 from schemas.arrays import Float32Array
 from velfield.compiled import kernel
 
+_KERNELS = {1: (1, 1), 9: (3, 1), 16: (4, 2)}
+"""Side and stride of a kernel by the number of its taps."""
 _BLOCK_ROWS = 576
 """Pixels of one matrix product: an eighth of half a batch at a quarter of the resolution."""
-
-
-class _Scratch(threading.local):
-    """Memory of each thread that every convolution uses again: fresh pages took a tenth of a training step."""
-
-    def __init__(self) -> None:
-        self._buffers: dict[str, Float32Array] = {}
-
-    def array(self, name: str, *shape: int) -> Float32Array:
-        """An array of whatever values; the next one of that name overwrites it."""
-        size, buffer = math.prod(shape), self._buffers.get(name)
-        if buffer is None or buffer.size < size:
-            buffer = self._buffers[name] = np.empty(size, np.float32)
-        return buffer[:size].reshape(shape)
-
-
-_scratch = _Scratch()
 
 
 def conv2d(
@@ -55,15 +36,14 @@ def conv2d(
     -------
     (count, height, width, channels out); half the height and the width for a kernel of 16 taps.
     """
-    matrix = weights.reshape(-1, weights.shape[2])
-    stride = _stride(weights)
+    side, stride = _KERNELS[len(weights)]
     count, height, width, _ = images.shape
+    matrix = weights.reshape(-1, weights.shape[2])
     out = np.empty((count, height // stride, width // stride, weights.shape[2]), np.float32)
-    rows = out.reshape(-1, weights.shape[2])
-    for start, stop, columns in _neighbourhoods(images, weights):
-        np.matmul(columns, matrix, out=rows[start:stop])
-        if bias is not None:
-            _add_bias(rows[start:stop], bias, relu)  # while the block is in the cache
+    no_bias = np.empty(0, np.float32)
+    _convolve(
+        _pad(images, side), matrix, no_bias if bias is None else bias, relu, side, stride, out.reshape(-1, out.shape[3])
+    )
     return out
 
 
@@ -85,82 +65,76 @@ def conv2d_backward(
     -------
     Gradient by the input, none where it is not wanted, and by the weights, each of its shape.
     """
-    if len(weights) == 9 and by_images:
-        return _conv3x3_backward(images, weights, gradient)
-    transposed = np.ascontiguousarray(weights.reshape(-1, weights.shape[2]).T)
-    rows = gradient.reshape(-1, weights.shape[2])
-    by_weights = np.zeros((weights.shape[0] * weights.shape[1], weights.shape[2]), np.float32)
-    count, height, width, channels = images.shape
-    side, stride, padded = _side(weights), _stride(weights), None
-    if by_images and side > 1:
-        padded = np.zeros((count, height + 2, width + 2, channels), np.float32)
-    for start, stop, columns in _neighbourhoods(images, weights):
-        by_weights += columns.T @ rows[start:stop]
-        if padded is not None:
-            np.matmul(rows[start:stop], transposed, out=columns)
-            _scatter(columns, padded, side, stride, start)
-    by_weights = by_weights.reshape(weights.shape)
-    if padded is not None:
-        return np.ascontiguousarray(padded[:, 1:-1, 1:-1]), by_weights
-    return (rows @ transposed).reshape(images.shape) if by_images else None, by_weights
+    side, stride = _KERNELS[len(weights)]
+    matrix = weights.reshape(-1, weights.shape[2])
+    by_matrix, padded = np.zeros_like(matrix), _pad(images, side)
+    by_padded = np.zeros(padded.shape if by_images else (0, 0, 0, 0), np.float32)
+    rows = np.ascontiguousarray(gradient).reshape(-1, weights.shape[2])
+    _convolve_backward(padded, matrix, rows, side, stride, by_matrix, by_padded)
+    by_weights = by_matrix.reshape(weights.shape)
+    if not by_images:
+        return None, by_weights
+    return np.ascontiguousarray(by_padded[:, 1:-1, 1:-1]) if side > 1 else by_padded, by_weights
 
 
-def _conv3x3_backward(
-    images: Float32Array, weights: Float32Array, gradient: Float32Array
-) -> tuple[Float32Array, Float32Array]:
-    """Both gradients from the neighbourhoods of the output's gradient, gathered once.
-
-    An input pixel reaches the output through the mirrored kernel: its gradient is a convolution, and the gradient by a
-    tap pairs each input pixel with the output pixel on the other side.
-    """
-    channels_in, channels_out = weights.shape[1:]
-    mirrored = np.ascontiguousarray(weights[::-1].transpose(0, 2, 1)).reshape(-1, channels_in)
-    by_images = np.empty(images.shape, np.float32)
-    values, found = images.reshape(-1, channels_in), by_images.reshape(-1, channels_in)
-    by_mirrored = np.zeros((9 * channels_out, channels_in), np.float32)
-    for start, stop, columns in _neighbourhoods(gradient, weights):
-        np.matmul(columns, mirrored, out=found[start:stop])
-        by_mirrored += columns.T @ values[start:stop]
-    by_weights = by_mirrored.reshape(9, channels_out, channels_in)[::-1].transpose(0, 2, 1)
-    return by_images, np.ascontiguousarray(by_weights)
-
-
-def _side(weights: Float32Array) -> int:
-    return {1: 1, 9: 3, 16: 4}[len(weights)]
-
-
-def _stride(weights: Float32Array) -> int:
-    return 2 if len(weights) == 16 else 1
-
-
-def _neighbourhoods(images: Float32Array, weights: Float32Array) -> Iterator[tuple[int, int, Float32Array]]:
-    """Blocks of output pixels: the first, the end, and what the kernel sees of each (n, taps x channels).
-
-    The next block overwrites the array, and so may the caller; a 1 x 1 kernel sees the images themselves.
-    """
-    side, stride = _side(weights), _stride(weights)
-    count, height, width, channels = images.shape
-    pixels = count * (height // stride) * (width // stride)
+def _pad(images: Float32Array, side: int) -> Float32Array:
+    """Images with a margin of one zero for a kernel of more than one tap."""
     if side == 1:
-        yield 0, pixels, images.reshape(pixels, channels)
-        return
-    padded = _scratch.array("padded", count, height + 2, width + 2, channels)
-    padded[:, 1:-1, 1:-1] = images
-    padded[:, 0], padded[:, -1], padded[:, :, 0], padded[:, :, -1] = 0, 0, 0, 0
-    buffer = _scratch.array("columns", min(_BLOCK_ROWS, pixels), side * side * channels)
-    for start in range(0, pixels, _BLOCK_ROWS):
-        stop = min(start + _BLOCK_ROWS, pixels)
-        columns = buffer[: stop - start]
-        _gather(padded, columns, side, stride, start)
-        yield start, stop, columns
+        return np.ascontiguousarray(images)
+    return np.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
 
 
 @kernel
-def _first_value(shape: tuple[int, int, int, int], stride: int, pixel: int) -> int:
-    """Where the neighbourhood of an output pixel begins in padded images of a shape, by the number of the value."""
+def _convolve(
+    padded: Float32Array,
+    matrix: Float32Array,
+    bias: Float32Array,
+    relu: bool,
+    side: int,
+    stride: int,
+    out: Float32Array,
+) -> None:
+    """Fill ``out`` (pixels, channels out); an empty ``bias`` is none."""
+    buffer = np.empty((min(_BLOCK_ROWS, out.shape[0]), matrix.shape[0]), np.float32)
+    for start in range(0, out.shape[0], _BLOCK_ROWS):
+        found = out[start : start + _BLOCK_ROWS]
+        columns = buffer[: found.shape[0]]
+        _gather(padded, columns, side, stride, start)
+        np.dot(columns, matrix, found)
+        if bias.size > 0:
+            _add_bias(found, bias, relu)  # while the block is in the cache
+
+
+@kernel
+def _convolve_backward(
+    padded: Float32Array,
+    matrix: Float32Array,
+    gradient: Float32Array,
+    side: int,
+    stride: int,
+    by_matrix: Float32Array,
+    by_padded: Float32Array,
+) -> None:
+    """Add the gradients by the weights and, unless it is empty, by the padded images to what they are; ``gradient``
+    (pixels, channels out) is that by the output."""
+    buffer = np.empty((min(_BLOCK_ROWS, gradient.shape[0]), matrix.shape[0]), np.float32)
+    for start in range(0, gradient.shape[0], _BLOCK_ROWS):
+        rows = gradient[start : start + _BLOCK_ROWS]
+        columns = buffer[: rows.shape[0]]
+        _gather(padded, columns, side, stride, start)
+        by_matrix += np.dot(columns.T, rows)
+        if by_padded.size > 0:
+            np.dot(rows, matrix.T, columns)
+            _scatter(columns, by_padded, side, stride, start)
+
+
+@kernel
+def _first_value(shape: tuple[int, int, int, int], margin: int, stride: int, pixel: int) -> int:
+    """Where the neighbourhood of an output pixel begins in images of a shape, padded by ``margin`` on each side, by the
+    number of the value."""
     _, height, width, channels = shape
-    line, x = divmod(pixel, (width - 2) // stride)
-    image, y = divmod(line, (height - 2) // stride)
+    line, x = divmod(pixel, (width - 2 * margin) // stride)
+    image, y = divmod(line, (height - 2 * margin) // stride)
     return ((image * height + y * stride) * width + x * stride) * channels
 
 
@@ -170,7 +144,7 @@ def _gather(padded: Float32Array, columns: Float32Array, side: int, stride: int,
     width, channels = padded.shape[2:]
     flat, length = padded.reshape(-1), side * channels
     for row in range(columns.shape[0]):
-        start = _first_value(padded.shape, stride, first + row)
+        start = _first_value(padded.shape, min(side - 1, 1), stride, first + row)
         neighbourhood = columns[row]
         for tap in range(side):
             # The taps of a row are adjacent in memory, in the image as in the neighbourhood.
@@ -186,7 +160,7 @@ def _scatter(columns: Float32Array, padded: Float32Array, side: int, stride: int
     width, channels = padded.shape[2:]
     flat, length = padded.reshape(-1), side * channels
     for row in range(columns.shape[0]):
-        start = _first_value(padded.shape, stride, first + row)
+        start = _first_value(padded.shape, min(side - 1, 1), stride, first + row)
         neighbourhood = columns[row]
         for tap in range(side):
             target = flat[start + tap * width * channels : start + tap * width * channels + length]

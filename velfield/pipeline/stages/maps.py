@@ -37,10 +37,14 @@ def make_maps(plan: Plan) -> StageResult:
 
     def write_figures() -> list[Path]:
         # One map after the other, each of the few pixels that vehicles passed: whole layers of float64 fill the memory.
-        return [*_write_direction(plan, scale, slow), *_write_speed(plan, scale), *_write_quality_figures(plan)]
+        return [*_write_direction(plan, scale, slow), *_write_speed(plan, scale)]
 
-    # The viewer's data take about as long as the figures.
-    writers: list[Callable[[], list[Path]]] = [write_figures, partial(write_view_data, layout)]
+    # The viewer's data take about as long as the figures of the field.
+    writers: list[Callable[[], list[Path]]] = [
+        write_figures,
+        partial(write_view_data, layout),
+        partial(_write_quality_figures, plan),
+    ]
     with ignore_missing_georeference():
         written = parallel_map(lambda write: write(), writers)
     advance("maps")
