@@ -179,6 +179,8 @@ class CnnRecord(BaseRecord):
     """The network as an ONNX model, base64."""
     activation_ranges: dict[str, tuple[FiniteFloat, FiniteFloat]] | None = Field(default=None, max_length=100)
     """Least and largest value of the network's activations, on images of the flight; none: it is run in float32."""
+    gamma: float | None = Field(default=None, gt=0.0, le=1.0)
+    """Exponent by which images of the flight are brightened; none: each image by its own."""
 
     @field_validator("onnx")
     @classmethod

@@ -19,6 +19,7 @@ from tools.training_data import (
     read_swissimage_unlabelled,
 )
 from velfield.bench.scenes import simulated_image
+from velfield.detection.cnn.brightness import brighten_sample
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record
 from velfield.detection.cnn.graph import network_to_record
@@ -61,7 +62,7 @@ def make_shipped_detector(data: Path, out: Path, steps: int = STEPS) -> list[str
         start=former.network,
         seed=SEED,
         steps=steps,
-        tiles=read_swissimage_unlabelled(data),
+        tiles=parallel_map(brighten_sample, read_swissimage_unlabelled(data)),
         tiles_from=steps * TILES_FROM // STEPS,
     )
     network = fit_sizes(network, groups, weights, seed=SEED)
@@ -113,15 +114,17 @@ def fit_shipped_sizes(data: Path, out: Path) -> list[str]:
 
 def _training_groups(
     sites: Sequence[Site], simulated: Sequence[LabelledImage]
-) -> tuple[list[Sequence[LabelledImage]], list[float]]:
-    """Groups of images to train on, and their weights."""
-    return [*(site.training for site in sites), simulated], [*(site.weight for site in sites), _SIMULATED_WEIGHT]
+) -> tuple[list[list[LabelledImage]], list[float]]:
+    """Groups of images to train on, as the network is to see them, and their weights."""
+    groups = [parallel_map(brighten_sample, group) for group in (*(site.training for site in sites), simulated)]
+    return groups, [*(site.weight for site in sites), _SIMULATED_WEIGHT]
 
 
 def _held_out(sites: Sequence[Site]) -> dict[str, Sequence[LabelledImage]]:
     """Parts of the sets that are held out of training, by name."""
     held_out = {site.name: site.held_out for site in sites if site.held_out}
-    return {**held_out, "simulated cities": parallel_map(_simulate_city, SIMULATED_SEEDS_HELD_OUT)}
+    held_out["simulated cities"] = parallel_map(_simulate_city, SIMULATED_SEEDS_HELD_OUT)
+    return {name: parallel_map(brighten_sample, samples) for name, samples in held_out.items()}
 
 
 def _evaluate(network: Network, held_out: dict[str, Sequence[LabelledImage]]) -> dict[str, HeldOutScores]:

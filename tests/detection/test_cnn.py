@@ -88,7 +88,9 @@ def test_the_threshold_of_few_cars_is_shrunk_towards_the_pretrained_one() -> Non
     assert shrunk.threshold - own.threshold == pytest.approx(0.1 * (1 - weight))
     assert own.curve is not None
     assert own.curve.operating_point is not None
-    assert own.curve.threshold[own.curve.operating_point] == pytest.approx(own.threshold, abs=0.03)
+    assert own.curve.threshold[own.curve.operating_point] == pytest.approx(
+        own.threshold, abs=0.05
+    )  # of few cars it has few points
 
 
 def test_lengths_and_widths_are_those_of_the_vehicles() -> None:

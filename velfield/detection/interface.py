@@ -205,6 +205,10 @@ class Detector(ABC):
                 "set detection.working_car_length_px"
             )
 
+    def in_light_of(self, images: Sequence[GreyImage]) -> "Detector":
+        """The detector, adjusted if possible to how bright these images (h, w) of the flight are."""
+        return self
+
     def for_flight(self, images: Sequence[GreyImage], config: Any) -> "Detector":
         """The detector, adjusted if possible to images (h, w) of the flight on the working grid; ``config`` is the
         section of its method, or of another."""

@@ -226,7 +226,7 @@ STAGES: tuple[Stage, ...] = (
     # The shipped detector, one that is fine-tuned on labelled frames, or a given one.
     Stage(
         name="detector",
-        version=30,
+        version=31,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),

@@ -9,6 +9,7 @@ import numpy as np
 
 from schemas.arrays import GreyImage, IntArray, Mask
 from schemas.detector import CnnConfig, CnnRecord, DetectorConfig
+from velfield.detection.cnn.brightness import brighten, brighten_by_itself, gamma_of
 from velfield.detection.cnn.fine_tuning import fine_tune
 from velfield.detection.cnn.graph import network_from_record
 from velfield.detection.cnn.inference import BORDER_PX, Predictor
@@ -45,10 +46,15 @@ class CnnDetector(Detector):
         """The network where it is run."""
         return Predictor(self.network, self.record.activation_ranges)
 
+    def in_light_of(self, images: Sequence[GreyImage]) -> "CnnDetector":
+        """With the exponent that brightens these images."""
+        gamma = gamma_of(np.concatenate([image.ravel() for image in images])) if images else None
+        return CnnDetector(self.record.model_copy(update={"gamma": gamma}))
+
     def for_flight(self, images: Sequence[GreyImage], config: DetectorConfig) -> "CnnDetector":
         """With the ranges of the activations on these images, so that it can be run in 8 bits."""
         wanted = isinstance(config, CnnConfig) and config.precision == "int8"
-        ranges = calibrate(self.network, images) if wanted else None
+        ranges = calibrate(self.network, [self._brighten(image) for image in images]) if wanted else None
         return CnnDetector(self.record.model_copy(update={"activation_ranges": ranges}))
 
     @property
@@ -95,10 +101,14 @@ class CnnDetector(Detector):
         border_px: int = 0,
         crops: IntArray | None = None,
     ) -> Detections:
-        length_px = self.record.working_car_length_px
-        rows = detect_cars(self.predictor, image, valid, border_px=border_px, crops=crops)
+        length_px, seen = self.record.working_car_length_px, self._brighten(image, valid)
+        rows = detect_cars(self.predictor, seen, valid, border_px=border_px, crops=crops)
         above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)] if len(rows) else rows
         return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT), above[:, 5:])
+
+    def _brighten(self, image: GreyImage, valid: Mask | None = None) -> GreyImage:
+        gamma = self.record.gamma
+        return brighten_by_itself(image, valid) if gamma is None else brighten(image, gamma)
 
     def refine(self, found: Detections, kept: Detections | None = None) -> Detections:
         """Non-maximum suppression."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from schemas.arrays import Mask
 from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
+from velfield.detection.cnn.brightness import brighten_sample
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.graph import network_to_record
 from velfield.detection.cnn.inference import Predictor, predict_heatmap
@@ -63,7 +64,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
     InputError
         The labels do not lie on cars: hardly one that was held out is found.
     """
-    masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained), samples)
+    masked = parallel_map(lambda sample: _mask_unlabelled_positives(brighten_sample(sample), pretrained), samples)
     count = sum(len(sample.cars) for sample in samples)
     trainer, steps, evidence = Trainer.from_network(pretrained), config.fine_tune_steps, None
     if count >= MIN_CARS_TO_HOLD_OUT:

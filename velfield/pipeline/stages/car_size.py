@@ -13,8 +13,9 @@ from velfield.detection.scale_search import REFINE_PX, STEP, View, Views, find_s
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import advance
 from velfield.pipeline.stages.rectified_frames import WorkingGrid
-from velfield.pipeline.stages.registration import usable_frames
+from velfield.pipeline.stages.registration import spread_usable_frames
 from velfield.run.frame_transforms import read_own_grid
+from velfield.run.stores import open_frames
 
 _FRAMES = 3
 _GSD_RANGE_M = 0.02, 0.6
@@ -42,7 +43,7 @@ def contradict_metadata(plan: Plan, metadata: ScaleEstimate) -> ScaleEstimate | 
     Cars are looked for at the scale of the metadata first, and at all others only where few are found there: what the
     detector finds at one scale can not confirm another.
     """
-    detector, grid = shipped_detector(), read_own_grid(plan.layout)
+    detector, grid = in_light_of_flight(plan, shipped_detector()), read_own_grid(plan.layout)
     car_px = float(detector.record.working_car_length_px)
     scale = car_px * metadata.gsd_m / CAR_LENGTH_M
     if scale**2 * grid.width_px * grid.height_px < _MAX_PX and is_plausible_scale(
@@ -62,10 +63,15 @@ def contradict_metadata(plan: Plan, metadata: ScaleEstimate) -> ScaleEstimate | 
     )
 
 
+def in_light_of_flight(plan: Plan, detector: Detector) -> Detector:
+    """The detector, adjusted to how bright the flight's frames are."""
+    store = open_frames(plan.layout.frames)
+    return detector.in_light_of([store.read(frame) for frame in spread_usable_frames(plan, _FRAMES)])
+
+
 def _views(plan: Plan) -> Views:
     """Windows that are spread over the base image, in turn of some frames."""
-    usable = np.flatnonzero(usable_frames(plan))
-    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).astype(int))] if len(usable) else usable
+    chosen = spread_usable_frames(plan, _FRAMES)
     opened = WorkingGrid.open(plan, 1.0)
 
     def views(scale: float, area_px: int) -> Iterator[View]:
@@ -74,7 +80,7 @@ def _views(plan: Plan) -> Views:
         frames = int(np.clip(area_px // (grid.width_px * grid.height_px * scale**2), 1, _FRAMES))
         count = len(windows) if len(windows) > 1 else frames
         for k in range(count if len(chosen) else 0):
-            rectified = working.frame(int(chosen[k % len(chosen)]), windows[k % len(windows)])
+            rectified = working.frame(chosen[k % len(chosen)], windows[k % len(windows)])
             if rectified is not None:
                 yield rectified.image, rectified.valid
         advance("detector", 0)

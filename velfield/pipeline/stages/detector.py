@@ -21,7 +21,7 @@ from velfield.detection.scale_search import working_scale
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.pipeline.stages.car_size import search_scale
+from velfield.pipeline.stages.car_size import in_light_of_flight, search_scale
 from velfield.pipeline.stages.labels import (
     base_px_per_raw_px,
     check_label_axes,
@@ -31,7 +31,7 @@ from velfield.pipeline.stages.labels import (
     median_car_length_raw_px,
 )
 from velfield.pipeline.stages.rectified_frames import WorkingGrid
-from velfield.pipeline.stages.registration import external_boxes, usable_frames
+from velfield.pipeline.stages.registration import external_boxes, spread_usable_frames
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_first_grid
 from velfield.run.stores import open_frames
@@ -58,7 +58,7 @@ def make_detector(plan: Plan) -> StageResult:
 
 def _from_file(plan: Plan) -> StageResult:
     """Load a detector file."""
-    detector = load_detector(Path(plan.job.inputs.detector or ""))
+    detector = in_light_of_flight(plan, load_detector(Path(plan.job.inputs.detector or "")))
     scale = _scale_of_boxes(plan, detector) if detector.reads_raw_frames else _known_scale(plan)
     return _finish(plan, detector, scale, "file")
 
@@ -68,10 +68,9 @@ def _scale_of_boxes(plan: Plan, detector: Detector) -> float:
     known = _scale_of_gsd(plan)
     if known is not None:
         return known
-    store, usable = open_frames(plan.layout.frames), np.flatnonzero(usable_frames(plan))
-    chosen = usable[np.unique(np.linspace(0, max(len(usable) - 1, 0), _FRAMES_TO_MEASURE).astype(int))]
+    store, chosen = open_frames(plan.layout.frames), spread_usable_frames(plan, _FRAMES_TO_MEASURE)
     threshold = plan.config.detection.threshold
-    boxes = pd.concat([detector.detect_raw(store.read(int(frame)), threshold=threshold) for frame in chosen])
+    boxes = pd.concat([detector.detect_raw(store.read(frame), threshold=threshold) for frame in chosen])
     if boxes.empty:
         raise InputError(
             f"the detector found no vehicle in {len(chosen)} frames, expected some, as the scale of the map comes from "
@@ -157,7 +156,7 @@ def _from_labels(plan: Plan) -> StageResult:
         )
     source, work_per_raw = Path(plan.job.inputs.source), scale * base_per_raw
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
-    detector = train_detector(samples, plan.config.detection)
+    detector = in_light_of_flight(plan, train_detector(samples, plan.config.detection))
     outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
     found = check_label_axes(samples) or check_label_scale(
         labels.cars, base_per_raw, read_first_grid(plan.layout).gsd_m
@@ -170,7 +169,7 @@ def _shipped(plan: Plan) -> StageResult:
     config = plan.config.detection
     if config.method != CnnConfig.model_fields["method"].default:
         raise InputError(f"detection.method={config.method} needs labelled cars: found none; give --labels")
-    detector = shipped_detector()
+    detector = in_light_of_flight(plan, shipped_detector())
     detector.check_car_length(config.working_car_length_px)
     scale = _scale_of_gsd(plan) or search_scale(plan, detector)
     if scale is None:
@@ -224,7 +223,6 @@ def _finish(
 
 def _images_to_calibrate(plan: Plan, scale: float) -> list[GreyImage]:
     """Some frames on the working grid, spread over the flight."""
-    working, usable = WorkingGrid.open(plan, scale), np.flatnonzero(usable_frames(plan))
-    chosen = usable[np.unique(np.linspace(0, max(len(usable) - 1, 0), _FRAMES_TO_CALIBRATE).astype(int))]
-    frames = (working.frame(int(frame)) for frame in chosen)
+    working = WorkingGrid.open(plan, scale)
+    frames = (working.frame(frame) for frame in spread_usable_frames(plan, _FRAMES_TO_CALIBRATE))
     return [frame.image for frame in frames if frame is not None]

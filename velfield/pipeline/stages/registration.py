@@ -192,6 +192,12 @@ def usable_frames(plan: Plan) -> Mask:
     return np.asarray(registered & ((flags & int(UNUSABLE)) == 0), np.bool_)
 
 
+def spread_usable_frames(plan: Plan, count: int) -> list[int]:
+    """At most ``count`` of them, spread over the flight."""
+    usable = np.flatnonzero(usable_frames(plan))
+    return usable[np.unique(np.linspace(0, max(len(usable) - 1, 0), count).astype(int))].tolist() if len(usable) else []
+
+
 def detect_frame_keypoints(plan: Plan, frame: int) -> Keypoints:
     """Detect the keypoints of a frame, raw px, outside the vehicles of the given boxes."""
     return _detect_keypoints(plan, frame, open_frames(plan.layout.frames).read(frame))
