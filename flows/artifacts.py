@@ -36,7 +36,7 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     """Create the artifacts of a finished run."""
     report = RunLayout(final_root(plan.layout.root)).report
     shown = f"velfield view {shlex.quote(str(report.parent))}"
-    lines = [f"# {plan.job.inputs.source}", "", f"The map and the report, in a browser: `{shown}`", ""]
+    lines = [f"# {plan.job.inputs.source}", "", f"The page of the run, in a browser: `{shown}`", ""]
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
     lost = [*summary.footage_lost, *(line for stage in summary.stages for line in stage.failures)]
     lines += ["", *(f"- warning: {line}" for stage in summary.stages for line in stage.warnings)]

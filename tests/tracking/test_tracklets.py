@@ -227,3 +227,17 @@ def test_weak_candidates_that_move_as_a_vehicle_make_tracklets_and_change_no_oth
     assert of_mover.sum() >= 7, "of ten windows"
     assert of_mover.mean() >= 0.9, "neither the car that stands nor what is no car"
     assert np.median(added["vx_01_px_per_s"][of_mover]) == pytest.approx(60, abs=2)
+
+
+def test_a_row_of_like_things_of_which_each_is_seen_now_and_then_is_nothing_that_moves() -> None:
+    """Skylights at a roof's edge: one that is seen here, the next one there, look like a vehicle at their distance."""
+    found = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        row = [car(rng, (40.0 + 14 * k, 80.0), (0.0, 0.0), similarity=1.0) for k in range(8)]
+        row = [replace(one, heading=lambda t: 0.0) for one in row]
+        seen = watch(row, np.arange(10) * 0.2, rng=rng, detector=Detector(recall=0.5, false_alarms=0.0))
+        sure, weak = _split(seen, set(range(8)))
+        tracklets, _ = link_windows(sure, TrackingConfig(), gsd_m=None, starts=ALL, weak=weak)
+        found += len(tracklets)
+    assert found < 20, "of 160 windows"

@@ -43,7 +43,7 @@ def test_a_short_clip_is_answered_by_what_is_missing() -> None:
     assert [lines for _, lines in page.answers[1:]] == [
         ("Not known: no junction of lanes was found.",),
         ("Not known: no junction of lanes was found.",),
-        ("Not known: no road with 8 vehicles that go freely and steadily.",),
+        ("Not known: no free-flow speed, as no road has 8 vehicles that go freely and steadily.",),
         (f"Not known: conflicts: none was seen in {seconds}, too short a time to say how rare they are.",),
     ]
     assert {d.name for d in traffic_diagrams(short, None)} <= {"place", "speed-profile"}

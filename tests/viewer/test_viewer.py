@@ -401,7 +401,7 @@ def test_a_short_clip_is_marked_as_of_few_vehicles_a_pixel(page: Page, address: 
         )
     )
     assert facts["of the map, passed by vehicles"] == coverage.percent(known, count.size)
-    assert facts["of that, by 5 or more"] == coverage.percent(well, known)
+    assert facts["of these pixels, by 5 vehicles or more"] == coverage.percent(well, known)
 
 
 PLOTS = """[...document.querySelectorAll('img.plot')].filter((plot) => plot.checkVisibility()).map((plot) =>

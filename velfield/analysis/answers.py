@@ -183,7 +183,7 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
         )
         yield Answer("speed", lanes_text(road.lanes), "found", text, speed.in_units(factor), unit)
     if not known:
-        text = "too little data: no road with 8 vehicles that go freely and steadily"
+        text = "too little data: no free-flow speed, as no road has 8 vehicles that go freely and steadily"
         yield Answer("speed", "", "too little data", text)
     unknown = sorted(lane for road in analysis.free_flow if not road.speed_m_per_s for lane in road.lanes)
     if known and (long := [lane for lane in unknown if analysis.lanes.lanes[lane].length_m >= _ROAD_M]):

@@ -264,7 +264,7 @@ STAGES: tuple[Stage, ...] = (
     # Windows of three frames that start in the unit; they reach 2 * max_interval_s behind it.
     Stage(
         name="tracklets",
-        version=5,
+        version=6,
         label="tracklets",
         lines=(Line("{tracklets:.0f} tracklets over three frames"),),
         unit=f"{_STAGES}.tracklets:link_unit",

@@ -220,6 +220,7 @@ def _select_moving(
     score = np.mean([window[k].score[found[:, k]] for k in range(3)], axis=0)
     confidence = _moving_vehicle(score, likely)
     accepted = best & (moved_px > 2 * stands_px) & (confidence >= frames.config.min_confidence)
+    accepted &= ~_meet_others(places, found, stands_px)
     log.add("moving_candidates", int(np.sum(accepted)))
     chosen = np.flatnonzero(accepted)[np.argsort(found[accepted, 1], kind="stable")]
     nothing = np.full((len(chosen), 2), np.nan)
@@ -235,6 +236,21 @@ def _movable(places: Sequence[FloatArray], stands_px: float) -> list[IntArray]:
         near = [np.isfinite(tree.query(xy, distance_upper_bound=stands_px)[0]) for tree in others]
         out.append(np.flatnonzero(~(near[0] & near[1])))
     return out
+
+
+def _meet_others(places: Sequence[FloatArray], triples: IntArray, stands_px: float) -> Mask:
+    """Whether something else is, in another of the three frames, at one of the places of a triple (n, 3).
+
+    Nothing drives up within two frames to where a vehicle was. A row of like things on a roof, of which each is seen
+    now and then, looks like one that moves from place to place.
+    """
+    trees = [cKDTree(xy) for xy in places]
+    taken = np.zeros(len(triples), np.bool_)
+    for k in range(3):
+        for j in {0, 1, 2} - {k}:
+            distance, row = trees[j].query(places[k][triples[:, k]], k=2, distance_upper_bound=stands_px)
+            taken |= (np.isfinite(distance) & (row != triples[:, j, None])).any(axis=1)
+    return taken
 
 
 def _moving_vehicle(score: FloatArray, likely: FloatArray) -> FloatArray:

@@ -119,7 +119,7 @@ def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, s
     covered = [
         ("vehicle tracks", f"{counts['tracks'].get('tracks', 0):.0f}"),
         ("of the map, passed by vehicles", percent(pixels, grid.width_px * grid.height_px)),
-        ("of that, by 5 or more", percent(field.get("pixels_5", 0), pixels)),
+        ("of these pixels, by 5 vehicles or more", percent(field.get("pixels_5", 0), pixels)),
     ]
     if not counts["registration"]:
         return [("tracks given", f"{times_s[-1] - times_s[0]:.1f} s, {plan.frame_count} times"), *covered]

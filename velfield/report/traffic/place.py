@@ -208,9 +208,10 @@ def place_caption(analysis: TrafficAnalysis, labels: MapLabels) -> str:
     out = f"{'; '.join(parts)}."
     if labels.junctions:
         legend = "" if labels.arms else f" ({analysis.arm_names.legend})"
+        number = labels.junctions[0].text[1:]
         out += (
-            " J3 is junction 3, or crossing 3, in the text; a junction's own arms are named by the side that they lead "
-            f"to{legend}."
+            f" J{number} is junction {number}, or crossing {number}, in the text; a junction's own arms are named by "
+            f"the side that they lead to{legend}."
         )
     if "crossing" in kinds:
         out += " Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn."
