@@ -394,7 +394,10 @@ def test_a_short_clip_is_marked_as_of_few_vehicles_a_pixel(page: Page, address: 
     page.wait("!document.querySelector('#summary-panel').hidden && document.getElementById('coverage-note').innerText")
     for place in ("#coverage-note", "#summary-panel .coverage-note"):
         text = page.value(f"document.querySelector('{place}').textContent")
-        assert "Directions are reliable; speeds and percentiles are those of single vehicles" in text
+        assert (
+            "Where fewer passed, directions and speeds are those of single vehicles, and of what was taken for one"
+            in text
+        )
     facts = dict(
         page.value(
             "[...document.querySelectorAll('.facts dl div')].map((d) => [...d.children].map((c) => c.textContent))"

@@ -27,8 +27,8 @@ def low_coverage_note(pixels: int, pixels_5: int) -> str:
     if 0 < pixels_5 < 0.01 * pixels:
         fraction = f"{pixels_5} of {pixels} known pixels {'was' if pixels_5 == 1 else 'were'}"
     return (
-        f"{fraction} passed by 5 or more vehicles. Directions are reliable; speeds and percentiles are those of "
-        "single vehicles. Record for longer, or merge several flights."
+        f"{fraction} passed by 5 or more vehicles. Where fewer passed, directions and speeds are those of single "
+        "vehicles, and of what was taken for one. Record for longer, or merge several flights."
     )
 
 
