@@ -211,7 +211,8 @@ def _select_moving(
     """
     window = tables[selected.start : selected.start + 3]
     places = [np.column_stack([t.x_px, t.y_px]) for t in window]
-    movable = _movable(places, stands_px)
+    trees = [cKDTree(xy) for xy in places]
+    movable = _movable(trees, stands_px)
     rows = [np.setdiff1d(movable[k], selected.detections[:, k]) for k in range(3)]
     left = _Frames([t.take(one) for t, one in zip(window, rows, strict=True)], frames.limits, frames.config)
     _, triples, best, likely = _link_window(0, left)
@@ -220,35 +221,33 @@ def _select_moving(
     score = np.mean([window[k].score[found[:, k]] for k in range(3)], axis=0)
     confidence = _moving_vehicle(score, likely)
     accepted = best & (moved_px > 2 * stands_px) & (confidence >= frames.config.min_confidence)
-    accepted &= ~_meet_others(places, found, stands_px)
+    accepted &= ~_meet_others(trees, found, stands_px)
     log.add("moving_candidates", int(np.sum(accepted)))
     chosen = np.flatnonzero(accepted)[np.argsort(found[accepted, 1], kind="stable")]
     nothing = np.full((len(chosen), 2), np.nan)
     return LinkedTriples(selected.start, found[chosen], nothing, confidence[chosen])
 
 
-def _movable(places: Sequence[FloatArray], stands_px: float) -> list[IntArray]:
-    """Rows of each of three frames where, in another frame, there is nothing."""
-    trees = [cKDTree(xy) for xy in places]
+def _movable(trees: Sequence[cKDTree], stands_px: float) -> list[IntArray]:
+    """Rows of each of three frames where, in another frame, there is nothing; ``trees`` of the places in each."""
     out = []
-    for k, xy in enumerate(places):
+    for k, mine in enumerate(trees):
         others = [tree for j, tree in enumerate(trees) if j != k]
-        near = [np.isfinite(tree.query(xy, distance_upper_bound=stands_px)[0]) for tree in others]
+        near = [np.isfinite(tree.query(mine.data, distance_upper_bound=stands_px)[0]) for tree in others]
         out.append(np.flatnonzero(~(near[0] & near[1])))
     return out
 
 
-def _meet_others(places: Sequence[FloatArray], triples: IntArray, stands_px: float) -> Mask:
+def _meet_others(trees: Sequence[cKDTree], triples: IntArray, stands_px: float) -> Mask:
     """Whether something else is, in another of the three frames, at one of the places of a triple (n, 3).
 
     Nothing drives up within two frames to where a vehicle was. A row of like things on a roof, of which each is seen
     now and then, looks like one that moves from place to place.
     """
-    trees = [cKDTree(xy) for xy in places]
     taken = np.zeros(len(triples), np.bool_)
     for k in range(3):
         for j in {0, 1, 2} - {k}:
-            distance, row = trees[j].query(places[k][triples[:, k]], k=2, distance_upper_bound=stands_px)
+            distance, row = trees[j].query(trees[k].data[triples[:, k]], k=2, distance_upper_bound=stands_px)
             taken |= (np.isfinite(distance) & (row != triples[:, j, None])).any(axis=1)
     return taken
 
