@@ -20,6 +20,7 @@ from prefect.runtime import flow_run
 
 from flows.launch import PAGES, PAGES_OF
 from schemas.summary import RunSummary
+from velfield.errors import count_text
 from velfield.pipeline.plan import Plan
 from velfield.run.layout import RunLayout, is_remote
 from velfield.run.results import final_root
@@ -40,7 +41,7 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
     lost = [*summary.footage_lost, *(line for stage in summary.stages for line in stage.failures)]
     lines += ["", *(f"- warning: {line}" for stage in summary.stages for line in stage.warnings)]
-    lines += ["", f"{len(summary.frames_lost)} frames lost.", "", *(f"- {line}" for line in lost), ""]
+    lines += ["", f"{count_text(len(summary.frames_lost), 'frame')} lost.", "", *(f"- {line}" for line in lost), ""]
     for name in ("direction", "speed"):
         image = plan.layout.maps / f"{name}_preview.png"
         if image.exists() and image.stat().st_size <= _MAX_IMAGE_BYTES:

@@ -49,4 +49,4 @@ class RunSummary(Model):
         """What was lost, in one line."""
         units = sum(len(stage.lost) for stage in self.stages)
         absent = ", part of the recording is missing" if self.footage_lost else ""
-        return f"incomplete: {len(self.frames_lost)} frames and {units} units lost{absent}"
+        return f"incomplete: frames lost: {len(self.frames_lost)}, units lost: {units}{absent}"

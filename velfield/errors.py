@@ -65,15 +65,16 @@ def one_line(error: object) -> str:
     return " ".join(str(error).split())[:160] or type(error).__name__
 
 
-def count_text(n: int, noun: str) -> str:
-    """A number and its noun.
+def count_text(n: float, noun: str) -> str:
+    """A number, rounded, and its noun.
 
     Examples
     --------
-    >>> count_text(1, "lane"), count_text(2, "lane")
-    ('1 lane', '2 lanes')
+    >>> count_text(1, "lane"), count_text(2, "lane"), count_text(0.9, "lane")
+    ('1 lane', '2 lanes', '1 lane')
     """
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+    number = f"{n:.0f}"
+    return f"{number} {noun}" if number == "1" else f"{number} {noun}s"
 
 
 def parse_json(data: str | bytes) -> Any:

@@ -7,6 +7,7 @@ import { corners, carFromEnds, contains, DEFAULT_RATIO, type Car } from "./cars"
 import { find } from "./dom";
 import { toLatLng, toPoint, type Point } from "./coordinates";
 import { imageMap, inside, post, served, showImage, type Served } from "./editor";
+import { countText } from "./units";
 
 interface ServerData extends Served {
   labels: string;
@@ -73,7 +74,7 @@ class Annotator {
     const width = find<HTMLInputElement>("width");
     width.disabled = this.selected === null;
     width.value = this.selected?.width_px?.toFixed(1) ?? "";
-    this.showStatus(`${here.length} ${here.length === 1 ? "car" : "cars"} in this frame`);
+    this.showStatus(`${countText(here.length, "car")} in this frame`);
   }
 
   private showStatus(text: string): void {
@@ -152,7 +153,7 @@ class Annotator {
     // A frame that lost its last car, and is not marked as empty, is no longer labelled.
     const cleared = [...this.touched].filter((name) => !labelled.has(name));
     const { cars } = await post<{ cars: number }>(this.data, "labels", { frames, cleared, cars: this.cars });
-    this.showStatus(`saved: ${cars} ${cars === 1 ? "car" : "cars"} in ${this.data.labels}`);
+    this.showStatus(`saved: ${countText(cars, "car")} in ${this.data.labels}`);
   }
 
   // -- controls --------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import { arrow, make, pairs } from "./dom";
 import type { Point } from "./coordinates";
 import { cautionNote, isShown, PERCENTILES } from "./percentiles";
 import type { Run } from "./run";
-import { percentile, roundUp, ticks, type Units } from "./units";
+import { countText, percentile, roundUp, ticks, type Units } from "./units";
 
 const FLOW_OF_S = 60; // in less a platoon may come or not
 const PLOT = { width: 280, height: 112, left: 10, bottom: 34, top: 6 };
@@ -18,7 +18,7 @@ export function showLine(crossings: Crossing[], [start, end]: [Point, Point], ru
     make(
       "p",
       { class: "note" },
-      `${length} long; ${crossings.length} crossings in ${seconds.toFixed(0)} s.`,
+      `${length} long; ${countText(crossings.length, "crossing")} in ${seconds.toFixed(0)} s.`,
     ),
   );
   const top = roundUp(Math.max(...crossings.map((c) => c.speed * units.perPxPerS), 1));
@@ -77,7 +77,7 @@ function bars(speeds: number[], top: number, unit: string): HTMLElement {
   const largest = Math.max(...counts, 1);
   const step = (width - 2 * left) / bins;
   const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", class: "bars" });
-  svg.setAttribute("aria-label", `Histogram of ${speeds.length} speeds from 0 to ${top} ${unit}`);
+  svg.setAttribute("aria-label", `Histogram of ${countText(speeds.length, "speed")} from 0 to ${top} ${unit}`);
   counts.forEach((count, k) => {
     const barHeight = ((height - bottom - PLOT.top) * count) / largest;
     const at = { x: left + k * step + 0.5, y: height - bottom - barHeight, width: step - 1, height: barHeight };

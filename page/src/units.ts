@@ -84,6 +84,11 @@ export class Units {
   }
 }
 
+/** "1 vehicle", "2 vehicles". */
+export function countText(n: number, noun: string): string {
+  return `${n} ${n === 1 ? noun : `${noun}s`}`;
+}
+
 /** The smallest of 1, 1.2, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is not below: as `round_up` of the figures. */
 export function roundUp(value: number): number {
   const power = 10 ** Math.floor(Math.log10(value));

@@ -21,7 +21,7 @@ import { loadRun, type Layer, type Run } from "./run";
 import { readState, writeState, type State } from "./state";
 import { listenToTabs, showTab } from "./tabs";
 import { loadSegments, TrackIndex } from "./tracks";
-import { Units } from "./units";
+import { countText, Units } from "./units";
 
 const TRACK_REACH_PX = 6; // screen pixels around the cursor
 const POINT_REACH_PX = 8; // screen pixels: a click this near a lane selects the lane
@@ -317,7 +317,7 @@ class Viewer {
     else {
       const speed = Math.hypot(vx, vy);
       const heading = speed > this.run.stationary_speed_px_per_s ? this.units.headingText(Math.atan2(vy, vx)) : "stationary";
-      readout.textContent = `${where} ${heading} · ${this.units.speedText(speed)} · ${n} ${n === 1 ? "vehicle" : "vehicles"}`;
+      readout.textContent = `${where} ${heading} · ${this.units.speedText(speed)} · ${countText(n, "vehicle")}`;
     }
     clearTimeout(this.resting);
     if (n) this.resting = window.setTimeout(() => void queryPixel(this.field, { x, y }).catch(() => undefined), REST_MS);

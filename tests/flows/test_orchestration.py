@@ -74,7 +74,7 @@ def test_a_run_that_lost_frames_is_shown_as_incomplete(server: None) -> None:
     shown = end_state(summary)
     assert isinstance(shown, State)
     assert (shown.name, shown.is_completed()) == ("Incomplete", True)
-    assert str(shown.message).startswith("incomplete: 1 frames and 1 units lost")
+    assert str(shown.message).startswith("incomplete: frames lost: 1, units lost: 1")
     by = choose_orchestration()
     assert by.run(lambda: summary, name="flow", folder="/flow", threads=1, parameters=None) is summary
     whole = RunSummary(root="RUN", stages=())

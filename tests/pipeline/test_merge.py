@@ -103,7 +103,7 @@ def test_two_drones_side_by_side_make_one_map(two: tuple[list[Flight], list[Path
     assert np.nanmedian(errors) < 1.0
 
     assert len(lines) == 1
-    found = re.match(r"(\d+) vehicles were seen by .* and count twice, of (\d+) and (\d+) tracks; (.*)", lines[0])
+    found = re.match(r"(\d+) vehicles seen by .*, counted twice, of (\d+) and (\d+) tracks; (.*)", lines[0])
     assert found is not None, lines[0]
     assert int(found[1]) == pytest.approx(len(truly_shared(*truth)), abs=2)
     apart = re.fullmatch(r"their clocks differ by (.*) s", found[4])

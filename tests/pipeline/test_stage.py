@@ -12,12 +12,13 @@ import pytest
 
 from schemas.flight import FlightConfig
 from schemas.model import Model
-from schemas.records import InputsRecord, SourceRecord
+from schemas.records import CommitRecord, InputsRecord, SourceRecord
 from schemas.summary import RunSummary
 from tests.small_flight import digests, job
 from velfield.bench.workers import compute_bare
 from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, Cut, NewBase, Stage, resolve, stage_keys
+from velfield.pipeline.summary import summarise_stage
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = SourceRecord(path="v", kind="video", digest="d", width=64, height=48, frame_count=9)
@@ -27,6 +28,13 @@ INPUTS = InputsRecord(source=SOURCE, base="b", labels="l", detector="d", detecti
 def functions(stage: Stage) -> list[str]:
     named = (stage.prepare, stage.block, stage.tiles, stage.unit, stage.remap)
     return [name for name in named if name is not None]
+
+
+def test_the_nouns_of_a_stages_line_follow_its_counts() -> None:
+    counts = {"tracks": 1.0, "doubtful": 2.0, "lone": 1.0}
+    record = CommitRecord(stage="tracks", unit="all", key="k", code_version="1", counts=counts)
+    text = summarise_stage("tracks", [record], units=1, before=(), seconds=0.0).text
+    assert text == "1 track; set aside as no vehicles: 2 doubtful tracks, 1 detection in no track"
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=list(STAGE))

@@ -292,6 +292,15 @@ def test_the_line_counts_as_python_does(page: Page, address: str, run: Run) -> N
     assert crossed > 3
 
 
+def test_one_crossing_is_no_crossings(page: Page, address: str, run: Run) -> None:
+    segments = run.segments()
+    middle = np.column_stack([segments["x0_px"] + segments["x1_px"], segments["y0_px"] + segments["y1_px"]]) / 2
+    lines = ((x - 4, y - 4, x + 4, y + 4) for x, y in middle.tolist())
+    ends = next(line for line in lines if len(run.crossings(line[:2], line[2:])) == 1)
+    page.open(f"{address}#line={','.join(map(str, ends))}")
+    page.wait("document.querySelector('#answer .note')?.textContent.includes('; 1 crossing in ')")
+
+
 def test_a_line_is_drawn_by_two_clicks_and_by_the_keyboard(page: Page, address: str) -> None:
     page.open(address)
     page.wait("document.getElementById('draw-line') !== null && document.querySelector('#layer option') !== null")

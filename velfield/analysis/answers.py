@@ -147,7 +147,7 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
         partly = DELAY_OF_PART if analysis.delay_is_partial(m.junction, m.arm_in) else ""
         delay = f", delay {estimate_text(m.delay_s, 's')}{partly}" if m.delay_s else ""
         subject = f"{_place(analysis, m.junction)}, {m.arm_in} to {m.arm_out}"
-        text = f"{count_text(round(m.seen + m.inferred), 'vehicle')}{share}{delay}"
+        text = f"{count_text(m.seen + m.inferred, 'vehicle')}{share}{delay}"
         yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
 
 
@@ -156,7 +156,7 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
         if not r.seen:
             continue  # the table has what is inferred alone
         share = _share_text(r.share, r.vehicles, r.origin.name)
-        text = f"{count_text(round(r.vehicles), 'vehicle')}, {r.seen} of them tracked all the way{share}"
+        text = f"{count_text(r.vehicles, 'vehicle')}, {r.seen} of them tracked all the way{share}"
         yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
 
 
@@ -324,9 +324,9 @@ def queue_text(queue: Queue) -> str:
     """
     n = queue.vehicles
     if queue.reaches_edge:
-        return f"at least {count_text(round(n.low), 'vehicle')} over {queue.length_m:.0f} m: where it ends is not seen"
+        return f"at least {count_text(n.low, 'vehicle')} over {queue.length_m:.0f} m: where it ends is not seen"
     ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
-    return f"{count_text(round(n.value), 'vehicle')}{ends}, {queue.length_m:.0f} m"
+    return f"{count_text(n.value, 'vehicle')}{ends}, {queue.length_m:.0f} m"
 
 
 def duration_text(seconds: float) -> str:

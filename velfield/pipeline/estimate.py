@@ -107,7 +107,7 @@ def describe_plan(plan: Plan, at_a_time: int = 2) -> str:
     for stage, units in planned_units(plan).items():
         done = sum(committed(plan, stage, unit) is not None for unit in units)
         total += len(units)
-        lines.append(f"  {stage:<13} {len(units):>5} units, {done:>5} done")
+        lines.append(f"  {stage:<13} units done: {done} of {len(units)}")
     root = plan.layout.root
     lines.append(f"{total} units; about {estimated_bytes(plan) / 1e9:.2f} GB needed in {root}{_free(root)}")
     memory = estimated_memory(plan, at_a_time) / 1e9

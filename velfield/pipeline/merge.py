@@ -6,6 +6,7 @@ from pathlib import Path
 
 from schemas.flight import assumed_gsd_m
 from velfield.analysis.shared_vehicles import MAX_OFFSET_S, find_shared_vehicles
+from velfield.errors import count_text
 from velfield.run.field_algebra import merge_fields
 from velfield.run.run import Run, open_run
 
@@ -58,7 +59,7 @@ def _shared_line(first: Run, second: Run) -> list[str]:
     counts = [table["track_id"].nunique() for table in tables]
     apart = f"; their clocks differ by {abs(shared.offset_s):.1f} s" if shared.offset_s else ""
     return [
-        f"{shared.count} vehicles were seen by {names[0]} and {names[1]} at the same time and count twice, of "
+        f"{count_text(shared.count, 'vehicle')} seen by {names[0]} and {names[1]} at the same time, counted twice, of "
         f"{counts[0]} and {counts[1]} tracks{apart}"
     ]
 

@@ -122,7 +122,7 @@ STAGES: tuple[Stage, ...] = (
         name="frames",
         version=5,
         label="frames",
-        lines=(Line("{usable:.0f} of {frames:.0f} frames read"),),
+        lines=(Line("{usable:.0f} of {frames:frame} read"),),
         prepare=f"{_STAGES}.frames:create_frame_store",
         unit=f"{_STAGES}.frames:read_unit",
         store="frames.zarr",
@@ -139,7 +139,7 @@ STAGES: tuple[Stage, ...] = (
         lines=(
             Line("every frame is usable", lambda counts: not counts.get("flagged")),
             Line(
-                "{usable:.0f} frames usable, {flagged:.0f} flagged: {blurred:.0f} blurred, {outliers:.0f} unlike their "
+                "{usable:frame} usable, {flagged:.0f} flagged: {blurred:.0f} blurred, {outliers:.0f} unlike their "
                 "neighbours",
             ),
         ),
@@ -176,7 +176,7 @@ STAGES: tuple[Stage, ...] = (
                 "{intersensor_error_px:.2f} px",
                 lambda counts: "intersensor_error_px" in counts,
             ),
-            Line("base image {width:.0f} x {height:.0f} px from {frames:.0f} frames"),
+            Line("base image {width:.0f} x {height:.0f} px from {frames:frame}"),
         ),
         unit=f"{_STAGES}.base_image:build_base",
         after=("frames", "lens"),
@@ -190,9 +190,7 @@ STAGES: tuple[Stage, ...] = (
         name="registration",
         version=20,
         label="registration",
-        lines=(
-            Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),
-        ),
+        lines=(Line("{registered:.0f} of {frames:frame} registered, hold-out registration error {heldout_px:.2f} px"),),
         prepare=f"{_STAGES}.registration:create_registration_store",
         unit=f"{_STAGES}.registration:register_unit",
         store="registration.zarr",
@@ -231,7 +229,7 @@ STAGES: tuple[Stage, ...] = (
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
             Line("used as it is", lambda counts: counts.get("labels") == 0),
-            Line("trained on {labels:.0f} labelled cars"),
+            Line("trained on {labels:labelled car}"),
         ),
         unit=f"{_STAGES}.detector:make_detector",
         after=("registration", "georeference"),
@@ -247,10 +245,10 @@ STAGES: tuple[Stage, ...] = (
         label="detections",
         lines=(
             Line(
-                "{cars:.0f} detections of vehicles in {frames:.0f} frames; {searched:.0%} of their area was searched",
+                "{cars:detection} of vehicles in {frames:frame}; {searched:.0%} of their area was searched",
                 lambda counts: "searched" in counts,
             ),
-            Line("{cars:.0f} detections of vehicles in {frames:.0f} frames"),
+            Line("{cars:detection} of vehicles in {frames:frame}"),
         ),
         block=f"{_STAGES}.detections:detect_block",
         unit=f"{_STAGES}.detections:write_detections",
@@ -266,7 +264,7 @@ STAGES: tuple[Stage, ...] = (
         name="tracklets",
         version=6,
         label="tracklets",
-        lines=(Line("{tracklets:.0f} tracklets over three frames"),),
+        lines=(Line("{tracklets:tracklet} over three frames"),),
         unit=f"{_STAGES}.tracklets:link_unit",
         after=("detections",),
         config=("tracking",),
@@ -281,11 +279,10 @@ STAGES: tuple[Stage, ...] = (
         label="tracks",
         lines=(
             Line(
-                "{tracks:.0f} vehicle tracks; {doubtful:.0f} doubtful ones and {lone:.0f} detections in no track set "
-                "aside",
+                "{tracks:track}; set aside as no vehicles: {doubtful:doubtful track}, {lone:detection} in no track",
                 lambda counts: "lone" in counts and bool(counts["doubtful"] + counts["lone"]),
             ),
-            Line("{tracks:.0f} vehicle tracks"),
+            Line("{tracks:track}"),
         ),
         unit=f"{_STAGES}.tracks:chain_tracks",
         after=("tracklets",),
@@ -302,15 +299,15 @@ STAGES: tuple[Stage, ...] = (
         label="scale",
         lines=(
             Line(
-                "{gsd_m:.3g} m a pixel by the lengths of {vehicles:.0f} vehicles",
+                "{gsd_m:.3g} m a pixel by the lengths of {vehicles:vehicle}",
                 lambda counts: "by_vehicles" in counts,
             ),
             Line(
-                "{gsd_m:.4g} m a pixel; by the lengths of {vehicles:.0f} vehicles {vehicle_gsd_m:.3g}",
+                "{gsd_m:.4g} m a pixel; by the lengths of {vehicles:vehicle} {vehicle_gsd_m:.3g}",
                 lambda counts: "gsd_m" in counts and "vehicle_gsd_m" in counts,
             ),
             Line("{gsd_m:.4g} m a pixel; too few vehicles to check it", lambda counts: "gsd_m" in counts),
-            Line("{vehicles:.0f} vehicles are too few to know the scale: speeds in px/s; give --gsd-m"),
+            Line("{vehicles:vehicle}: too few to know the scale: speeds in px/s; give --gsd-m"),
         ),
         unit=f"{_STAGES}.scale:scale_run",
         after=("georeference", "tracks"),
@@ -324,7 +321,7 @@ STAGES: tuple[Stage, ...] = (
         name="field",
         version=4,
         label="field",
-        lines=(Line("{pixels:.0f} pixels were passed by vehicles, {pixels_5:.0f} of them by 5 or more"),),
+        lines=(Line("{pixels:pixel} passed by vehicles, {pixels_5:.0f} of them by 5 or more"),),
         prepare=f"{_STAGES}.field:create_field_stores",
         tiles=f"{_STAGES}.field:field_blocks",
         unit=f"{_STAGES}.field:accumulate_block",

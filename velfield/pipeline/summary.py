@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from schemas.records import CommitRecord
 from schemas.summary import RunSummary, StageSummary
+from velfield.errors import count_text
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import STAGE
 from velfield.run.stores import open_frames, open_registration
@@ -11,6 +12,13 @@ from velfield.sources.frames import FootageLoss
 
 _MEANS = frozenset({"heldout_px", "residual_px", "searched"})
 """Counts that are averaged over units, weighted by frames; all others are summed."""
+
+
+class _Count(float):
+    """A count in a line of a stage: ``{frames:.0f}`` is a number, ``{frames:frame}`` a number with this noun."""
+
+    def __format__(self, spec: str) -> str:
+        return count_text(self, spec) if spec[:1].isalpha() else super().__format__(spec)
 
 
 def summarise_stage(
@@ -26,11 +34,12 @@ def summarise_stage(
     lost = lost or {}
     counts = _total([record.counts for record in records])
     line = next(line.text for line in STAGE[name].lines if line.when(counts))
-    text = line.format_map({key: counts.get(key, float("nan")) for key in _keys(line)})
+    text = line.format_map({key: _Count(counts.get(key, "nan")) for key in _keys(line)})
     if before:
-        text += f" ({len(before)} of {units} units done before)" if len(before) < units else " (done before)"
+        part = f"{len(before)} of {count_text(units, 'unit')} " if len(before) < units else ""
+        text += f" ({part}done before)"
     if lost:
-        text += f"; {len(lost)} of {units} units lost"
+        text += f"; {len(lost)} of {count_text(units, 'unit')} lost"
     return StageSummary(
         name=name,
         units=units,

@@ -12,6 +12,7 @@ from importlib.resources import files
 from urllib.parse import quote
 
 from schemas.report import Report, ReportFigure, ReportStage
+from velfield.errors import count_text
 from velfield.report.gates import rejection_table, totals_table
 from velfield.report.plots import precision_recall_plot, residual_plot
 
@@ -91,7 +92,8 @@ def _warnings(report: Report) -> str:
     lost = sum(stage.lost for stage in report.stages)
     lines = list(report.warnings)
     if report.frames_lost or lost:
-        lines.insert(0, f"Not complete: {len(report.frames_lost)} frames and {lost} units lost. They are listed below.")
+        frames = count_text(len(report.frames_lost), "frame")
+        lines.insert(0, f"Not complete: {frames} and {count_text(lost, 'unit')} lost, as listed below.")
     elif report.footage_lost:
         lines.insert(0, "Not complete: a part of the recording is not there, as listed below.")
     return _section("Warnings", _items(lines), "warnings") if lines else ""
@@ -145,7 +147,7 @@ def _registration(report: Report) -> str:
     if series is None or not series.times_s:
         return ""
     good = sorted(r for r in series.residual_px if r is not None)
-    text = f"{len(good)} of {len(series.times_s)} frames registered."
+    text = f"{len(good)} of {count_text(len(series.times_s), 'frame')} registered."
     if good:
         middle, late = good[len(good) // 2], good[min(int(len(good) * 0.95), len(good) - 1)]
         text += f" Residual on held-out control points: median {middle:.2f} px, 95 % below {late:.2f} px."
@@ -187,7 +189,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: int) 
 def _frames_lost(frames: Sequence[str]) -> str:
     if not frames:
         return ""
-    body = f"<details><summary>{len(frames)} frames without tracklets</summary>{_items(frames)}</details>"
+    body = f"<details><summary>{count_text(len(frames), 'frame')} without tracklets</summary>{_items(frames)}</details>"
     return _section("Frames lost", body)
 
 

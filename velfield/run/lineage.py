@@ -8,7 +8,7 @@ import pandas as pd
 
 from schemas.arrays import Mask
 from schemas.records import CommitRecord, RebaseRecord
-from velfield.errors import InputError
+from velfield.errors import InputError, count_text
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.segments import SEGMENT_DTYPE, Segments, VelocityBins, band_radius_px, segment_table, tracks_in
 from velfield.run.commits import read_commits
@@ -171,8 +171,9 @@ def describe_lineage(run: Run) -> str:
 def describe_pixel(run: Run, pixel: PixelLineage) -> str:
     """A pixel's lineage, as text."""
     vehicles, tracklets = len(pixel.tracks), sum(len(p.tracklets) for p in pixel.tracks)
-    head = f"pixel ({pixel.x}, {pixel.y}): {vehicles} vehicle tracks, {tracklets} tracklets in "
-    lines = [f"{head}{len(pixel.frames)} frames of {run.record.inputs.source.path}"]
+    counts = ", ".join([count_text(vehicles, "vehicle track"), count_text(tracklets, "tracklet")])
+    frames = count_text(len(pixel.frames), "frame")
+    lines = [f"pixel ({pixel.x}, {pixel.y}): {counts} in {frames} of {run.record.inputs.source.path}"]
     for track in pixel.tracks:
         lines.append(f"track {track.track_id}: tracklets {', '.join(map(str, track.tracklets))}")
         lines.append(f"  in frames {', '.join(map(str, track.frames))}")

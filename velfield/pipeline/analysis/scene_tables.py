@@ -10,6 +10,7 @@ from velfield.analysis.movements.gates import Arm
 from velfield.analysis.movements.scene import OriginDestination, Relation
 from velfield.analysis.movements.time_slices import SliceCount
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.errors import count_text
 from velfield.pipeline.analysis.cells import Column, estimates, make_table
 
 
@@ -53,11 +54,11 @@ def _note(scene: OriginDestination) -> str:
     trips = scene.trips
     seen, remain, elsewhere = (int(of.sum()) for of in (trips.seen, trips.remains, trips.elsewhere))
     cut = len(trips.track) - seen - remain - elsewhere
-    rare = f"{elsewhere} left by roads that fewer than three took, " if elsewhere else ""
+    rare = f"left by roads that fewer than three took: {elsewhere}; " if elsewhere else ""
     return (
-        f"{len(trips.track)} vehicles entered the picture: {seen} were seen to leave, {rare}{cut} have tracks that are "
-        f"cut, {remain} were still there at the end. Not counted: {scene.before} tracks there at the start, and "
-        f"{scene.unknown} that begin inside, most of them the rest of one that was cut."
+        f"{count_text(len(trips.track), 'vehicle')} entered the picture; seen to leave: {seen}; {rare}"
+        f"cut tracks: {cut}; still there at the end: {remain}. Not counted: {count_text(scene.before, 'track')} there "
+        f"at the start, and {scene.unknown} that begin inside, most of them the rest of one that was cut."
     )
 
 

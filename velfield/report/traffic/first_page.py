@@ -115,7 +115,7 @@ def _approaches(found: JunctionMovements, known: list[ApproachDelay], longest: M
     out = []
     for name in (*delays, *(name for name in longest if name not in delays)):
         entered = sum(m.seen + m.inferred for m in found.movements if m.arm_in == name)
-        said = [count_text(round(entered), "vehicle")]
+        said = [count_text(entered, "vehicle")]
         said.append(f"mean delay {delays[name].text}" if name in delays else _NO_DELAY)
         if name in longest:
             said.append(f"longest queue of a lane when green begins {queue_text(longest[name])}")
