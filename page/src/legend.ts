@@ -69,7 +69,7 @@ function wheel(layer: Layer, run: Run): HTMLElement {
   const names: [string, number][] =
     north === null ? [["up", -Math.PI / 2]] : [..."NESW"].map((name, k) => [name, north + (k * Math.PI) / 2]);
   for (const [name, angle] of names) context.fillText(name, at(angle, 56), at(angle - Math.PI / 2, 56));
-  const note = north === null ? `${layer.description} North is not known: up is that of the image.` : layer.description;
+  const note = north === null ? `${layer.description} North is not known: up is the top of the image.` : layer.description;
   return make("div", { class: "wheel" }, canvas, make("p", { class: "note" }, note));
 }
 

@@ -4,6 +4,7 @@ import io
 import json
 import struct
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,19 @@ def test_lines_and_arrows_point_where_their_headings_do(georeference: Georeferen
         step = ground_steps(np.array(arrow["geometry"]["coordinates"][0]))
         assert_same_deg(bearing_deg(step), np.full(1, arrow["properties"]["heading_deg"]), within=1.5)
         assert np.hypot(*step[0]) == pytest.approx(arrow["properties"]["speed_km_per_h"] / 3.6 * 0.5, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("north_rad", "since", "heading"),
+    [(None, "top of the image", 90.0), (0.0, "north", 0.0), (np.pi / 2, "north", 270.0)],
+)
+def test_headings_without_a_reference_system_say_where_they_begin(
+    north_rad: float | None, since: str, heading: float
+) -> None:
+    to_the_right = tracklets_of({1: (10.0, 100.0, 40.0, 0.0, 9)})
+    table = pq.read_table(io.BytesIO(tracklets_geoparquet(to_the_right, replace(PIXELS, north_rad=north_rad))))
+    assert set(table["heading_from"].to_pylist()) == {since}
+    np.testing.assert_allclose(table["heading_deg"].to_numpy(), heading, atol=0.5)
 
 
 @pytest.fixture(scope="module")

@@ -82,7 +82,7 @@ def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str
     assert re.search(r"signal +junction \d: cycle 40.0 s \(\d", text)
     assert re.search(r"junction \d, W to E: \d+ vehicles, \d+ % \(\d+ to \d+\) of \d+ from W", text)
     assert re.search(r"u-turns +none in \d.* min, so fewer than \d", text)
-    assert "directions  N: the top of the image\n" in text
+    assert "directions  north is not known: N is the top of the image, W its left\n" in text
 
 
 def test_the_time_is_that_of_all_rows_where_few_vehicles_drive_for_a_part_of_it(tmp_path: Path) -> None:

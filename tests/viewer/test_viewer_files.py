@@ -102,7 +102,7 @@ def test_what_compare_left_is_shown(whole: tuple[Path, RunSummary], tmp_path: Pa
 def test_the_report_goes_by_mail(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
     page = export_run(open_run(whole[0]), "report", tmp_path / "report.html").read_text()
     assert page.count("data:image/jpeg;base64,") >= 2
-    assert "clockwise from the image" in (whole[0] / "index.html").read_text()
+    assert "clockwise from the top of the image" in (whole[0] / "index.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "<script" not in page
     assert "Direction of travel" in page

@@ -27,17 +27,21 @@ class Georeference:
         Reference system, and (column, row) of pixel corners to its coordinates; None without one.
     gsd_m
         Metres a base pixel; None if unknown.
+    north_rad
+        Direction of true north, from +x towards +y (down), where it is known without a reference system, as by a
+        drone's compass; else None.
     """
 
     shape: tuple[int, int]
     crs_wkt: str | None = None
     affine: tuple[float, float, float, float, float, float] | None = None
     gsd_m: float | None = None
+    north_rad: float | None = None
 
     @classmethod
     def from_grid(cls, grid: GridRecord) -> "Georeference":
         """Georeference of a run's base image."""
-        return cls((grid.height_px, grid.width_px), grid.crs_wkt, grid.affine, grid.gsd_m)
+        return cls((grid.height_px, grid.width_px), grid.crs_wkt, grid.affine, grid.gsd_m, grid.north_rad)
 
     @property
     def has_crs(self) -> bool:
@@ -78,8 +82,13 @@ class Georeference:
         gsd_m = require_gsd_m(self.gsd_m)
         return np.column_stack([xy_px[:, 0] + 0.5, self.shape[0] - 0.5 - xy_px[:, 1]]) * gsd_m
 
+    @property
+    def heading_from(self) -> str:
+        """Where headings begin: ``north``, or ``top of the image`` where north is not known."""
+        return "north" if self.has_crs or self.north_rad is not None else "top of the image"
+
     def heading_deg(self, xy_px: Points, velocity_px_per_s: Points) -> FloatArray:
-        """Direction of travel, degrees clockwise from north; from the image's top where there is no reference system.
+        """Direction of travel, degrees clockwise from `heading_from`.
 
         Examples
         --------
@@ -88,7 +97,7 @@ class Georeference:
         [0.0, 90.0, 180.0]
         """
         if not self.has_crs:
-            return heading_deg(np.arctan2(velocity_px_per_s[:, 1], velocity_px_per_s[:, 0]), None)
+            return heading_deg(np.arctan2(velocity_px_per_s[:, 1], velocity_px_per_s[:, 0]), self.north_rad)
         speed = np.linalg.norm(velocity_px_per_s, axis=1, keepdims=True)
         step = np.divide(velocity_px_per_s, speed, out=np.zeros_like(velocity_px_per_s), where=speed > 0)
         here, there = self.to_lonlat(xy_px), self.to_lonlat(xy_px + step)

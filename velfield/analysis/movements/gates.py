@@ -67,7 +67,7 @@ class ArmNames:
     @property
     def legend(self) -> str:
         """What N stands for."""
-        return "N: the top of the image" if self.north_rad is None else "N: north"
+        return "north is not known: N is the top of the image, W its left" if self.north_rad is None else "N is north"
 
     def of(
         self,

@@ -40,7 +40,7 @@ def tracklets_geoparquet(tracklets: pd.DataFrame, georeference: Georeference) ->
 
     Returns
     -------
-    The file's bytes: ``geometry`` WKB, ``bbox`` struct, the tracklets' columns, and ``heading_deg``.
+    The file's bytes: ``geometry`` WKB, ``bbox`` struct, the tracklets' columns, ``heading_deg`` and ``heading_from``.
     """
     table, lines = tracklet_lines(tracklets, georeference)
     low, high = lines.min(axis=1), lines.max(axis=1)
@@ -52,13 +52,15 @@ def tracklets_geoparquet(tracklets: pd.DataFrame, georeference: Georeference) ->
 
 
 def tracklet_lines(tracklets: pd.DataFrame, georeference: Georeference) -> tuple[pa.Table, FloatArray]:
-    """Tracklets as a table (``geometry`` WKB, ``heading_deg``, their own columns), and their lines (n, 3, 2)."""
+    """Tracklets as a table (``geometry`` WKB, ``heading_deg``, ``heading_from``, their own columns), and their lines
+    (n, 3, 2)."""
     xy = np.stack([tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64) for k in range(3)], axis=1)
     flat = xy.reshape(-1, 2)
     lines = (georeference.to_crs(flat) if georeference.has_crs else flat * (1.0, -1.0)).reshape(-1, 3, 2)
     columns: dict[str, pa.Array] = {
         "geometry": pa.array([_LINE.pack(1, _LINE_STRING, 3, *line.ravel()) for line in lines], pa.binary()),
         "heading_deg": pa.array(_headings(tracklets, xy, georeference), pa.float32()),
+        "heading_from": pa.array([georeference.heading_from] * len(lines)),
     }
     columns |= {str(name): pa.array(tracklets[name].to_numpy()) for name in tracklets.columns}
     return pa.table(columns), lines

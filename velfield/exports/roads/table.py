@@ -15,9 +15,10 @@ def trajectory_table(run: Run) -> pd.DataFrame:
     Returns
     -------
     DataFrame ``track_id, frame, time_s, x_m, y_m, vx_m_per_s, vy_m_per_s, ax_m_per_s2, ay_m_per_s2, speed_m_per_s,
-    heading_deg, lane, length_m, width_m, vehicle_class, class_probability`` and, with a reference system,
-    ``longitude_deg, latitude_deg``; x to the right of the map and y down, from its upper left corner; ``lane`` -1 where
-    none was found, dimensions NaN and classes missing of a vehicle that was not measured; by track and time.
+    heading_deg, heading_from, lane, length_m, width_m, vehicle_class, class_probability`` and, with a reference system,
+    ``longitude_deg, latitude_deg``; x to the right of the map and y down, from its upper left corner; ``heading_from``
+    ``north`` or ``top of the image``; ``lane`` -1 where none was found, dimensions NaN and classes missing of a vehicle
+    that was not measured; by track and time.
 
     Raises
     ------
@@ -52,6 +53,7 @@ def trajectory_table(run: Run) -> pd.DataFrame:
             "ay_m_per_s2": acceleration[:, 1],
             "speed_m_per_s": paths.speed_m_per_s,
             "heading_deg": georeference.heading_deg(xy_px, velocity),
+            "heading_from": georeference.heading_from,
             "lane": lane,
         }
     )

@@ -65,7 +65,7 @@ def _write_direction(plan: Plan, scale: MapScale, slow_px_per_s: float) -> list[
     direction = direction_rad(velocity, stationary_speed_px_per_s=slow_px_per_s)
     figure = direction_figure(read_base_image(plan.layout, plan.config.frames), _spread(known, direction), scale)
     north = scale.north_rad
-    about = "heading, clockwise from north" if north is not None else "heading, clockwise from the image's top"
+    about = "heading, clockwise from north" if north is not None else "heading, clockwise from the top of the image"
     layer = _spread(known, heading_deg(direction, north).astype(np.float32))
     return [*_write_figure(plan, "direction", figure), _write_layer(plan, "direction", layer, about, "degree")]
 

@@ -166,7 +166,9 @@ def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
 
 def _files(plan: Plan) -> list[tuple[str, str]]:
     layout, files = plan.layout, []
-    north = "the image's top: north is not known" if north_direction_rad(read_grid(plan.layout)) is None else "north"
+    north = (
+        "the top of the image: north is not known" if north_direction_rad(read_grid(plan.layout)) is None else "north"
+    )
     for path, what in (
         (layout.maps / "direction.png", "modal direction"),
         (layout.maps / "speed.png", "modal speed"),
