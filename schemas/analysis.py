@@ -75,6 +75,14 @@ class QuestionRecord(Model):
     lines: tuple[str, ...]
 
 
+class NameRecord(Model):
+    """A name on the map: of a junction (``J0``), or of a road by which vehicles come into the picture and leave it."""
+
+    name: str
+    x_px: float
+    y_px: float
+
+
 class AnalysisRecord(Model):
     """``analysis.json``: all tables."""
 
@@ -90,6 +98,9 @@ class AnalysisRecord(Model):
     """Tracks of moving vehicles that were analysed."""
     level: float = Field(0.9, gt=0, lt=1)
     """Probability that an interval is to have."""
+    directions: str = ""
+    """What N stands for in names of roads, for people."""
+    names: tuple[NameRecord, ...] = ()
     answers: tuple[QuestionRecord, ...] = ()
     """The first page of the report; last, what could not be said and why."""
     tables: tuple[AnalysisTable, ...]

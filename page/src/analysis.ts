@@ -11,10 +11,11 @@ export interface Geometry {
   xy_px: [number, number][];
 }
 
-/** A row of a table on the map; its label is empty where nothing in the row names it alone. */
+/** A row of a table on the map, its label empty where nothing in the row names it alone; or a name, which has no mark. */
 export interface Place {
   geometry: Geometry;
   label: string;
+  isName?: true;
 }
 
 interface Estimate {
@@ -45,6 +46,8 @@ interface Analysis {
   tracks: number;
   level: number;
   gsd_known: boolean;
+  directions?: string;
+  names?: { name: string; x_px: number; y_px: number }[];
   answers?: { question: string; lines: string[] }[];
   tables: Table[];
 }
@@ -103,23 +106,25 @@ export class AnalysisPanel {
     });
     const metres = analysis.gsd_known ? "" : " The scale is not known: lengths assume 0.23 m per pixel.";
     const about = `${analysis.tracks} tracks of moving vehicles in ${analysis.duration_s.toFixed(0)} s. Grey: ${Math.round(100 * analysis.level)} % interval and n, the number of observations.${metres}`;
+    const named = `J0 on the map is junction 0. Roads are named by where they lead to (${analysis.directions}).`;
+    const names = analysis.names?.length ? [make("p", { class: "note" }, named)] : [];
     const note = make("p", { class: "note" }, table.note);
     const answers = (analysis.answers ?? []).flatMap(({ question, lines }) => [make("dt", {}, question), ...lines.map((line) => make("dd", {}, line))]);
-    const content: HTMLElement[] = [make("p", { class: "note" }, about), make("dl", { class: "answers" }, ...answers), make("label", {}, "Table ", choice), note];
-    content.push(table.rows.length ? this.rows(table) : make("p", {}, "Nothing of this kind was found."));
+    const content: HTMLElement[] = [make("p", { class: "note" }, about), ...names, make("dl", { class: "answers" }, ...answers), make("label", {}, "Table ", choice), note];
+    content.push(table.rows.length ? this.rows(analysis, table) : make("p", {}, "Nothing of this kind was found."));
     if (table.rows.length > MAX_ROWS) content.push(make("p", { class: "note" }, `and ${table.rows.length - MAX_ROWS} more, in analysis/analysis.json`));
     find("analysis-content").replaceChildren(...content);
-    this.draw(places(table), null);
+    this.draw(places(analysis, table), null);
   }
 
-  private rows(table: Table): HTMLElement {
+  private rows(analysis: Analysis, table: Table): HTMLElement {
     const shown = table.rows.slice(0, MAX_ROWS);
     const placed = shown.some(({ geometry }) => geometry);
     const titles = table.columns.map(({ title, unit }) => `${title}${this.shownUnit(unit) && `, ${this.shownUnit(unit)}`}`);
     const element = grid(
       [...(placed ? ["Map"] : []), ...titles],
       shown.map((row, k) => [
-        ...(placed ? [this.button(table, row, k)] : []),
+        ...(placed ? [this.button(analysis, table, row, k)] : []),
         ...table.columns.map(({ name, unit }) => this.cell(row.cells[name] ?? null, unit)),
       ]),
     );
@@ -127,11 +132,11 @@ export class AnalysisPanel {
     return make("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": label }, element);
   }
 
-  private button(table: Table, row: Row, k: number): HTMLElement | string {
+  private button(analysis: Analysis, table: Table, row: Row, k: number): HTMLElement | string {
     const { geometry } = row;
     if (!geometry) return "";
     const button = make("button", { type: "button", "aria-label": `Show row ${k + 1} on the map`, class: "place" }, "●");
-    button.addEventListener("click", () => this.draw(places(table), geometry));
+    button.addEventListener("click", () => this.draw(places(analysis, table), geometry));
     return button;
   }
 
@@ -157,9 +162,15 @@ export class AnalysisPanel {
   }
 }
 
-/** The rows of a table that lie on the map, with their first cells as labels where no two rows share one. */
-function places(table: Table): Place[] {
-  const labels = table.rows.map(({ cells }) => cells[table.columns[0]!.name] ?? "");
-  const named = new Set(labels).size === labels.length && labels.every((label) => typeof label !== "object");
-  return table.rows.flatMap(({ geometry }, k) => (geometry ? [{ geometry, label: named ? String(labels[k]) : "" }] : []));
+/** The names, and the rows of a table that lie on the map, with their first cells as labels where no two rows share one. */
+function places({ names }: Analysis, table: Table): Place[] {
+  const first = table.columns[0]!.name;
+  const labels = table.rows.map(({ cells }) => cells[first] ?? "");
+  const named = first !== "junction" && new Set(labels).size === labels.length && labels.every((label) => typeof label !== "object");
+  const rows = table.rows.flatMap(({ geometry }, k) => (geometry ? [{ geometry, label: named ? String(labels[k]) : "" }] : []));
+  return [...(names ?? []).map(nameOnMap), ...rows];
+}
+
+function nameOnMap({ name, x_px, y_px }: { name: string; x_px: number; y_px: number }): Place {
+  return { geometry: { type: "Point", xy_px: [[x_px, y_px]] }, label: name, isName: true };
 }

@@ -55,8 +55,9 @@ export class Drawings {
   /** The places of a table's rows with their labels, and arrows on lines; the chosen one in white; the map moves to it. */
   showPlaces(all: Place[], chosen: Geometry | null): void {
     this.places.clearLayers();
-    for (const { geometry } of all) this.addGeometry(geometry, "#000", 4);
-    for (const { geometry } of all) this.addGeometry(geometry, "#5ee0ff", 2);
+    const marked = all.filter(({ isName }) => !isName);
+    for (const { geometry } of marked) this.addGeometry(geometry, "#000", 4);
+    for (const { geometry } of marked) this.addGeometry(geometry, "#5ee0ff", 2);
     const first = all.filter(({ geometry }) => geometry === chosen);
     this.labels.show([...first, ...all.filter(({ geometry }) => geometry !== chosen)]);
     if (!chosen) return;

@@ -44,17 +44,17 @@ export class Labels {
   show(places: Place[]): void {
     this.group.clearLayers();
     const added = places
-      .map(({ geometry, label }) => ({ spots: spotsOf(geometry), label }))
+      .map((place) => ({ ...place, spots: spotsOf(place.geometry) }))
       .filter(({ spots, label }) => label || spots[0]!.direction !== null)
-      .map(({ spots, label }) => this.add(spots, label));
+      .map(({ spots, label, isName }) => this.add(spots, label, isName ? "place-label name" : "place-label"));
     const texts = added.map(({ marker }) => marker.getElement()!.querySelector<HTMLElement>(".place-label")!);
     const sizes = texts.map(({ offsetWidth, offsetHeight }) => [offsetWidth, offsetHeight] as const);
     this.labels = added.map((label, k) => ({ ...label, width: sizes[k]![0], height: sizes[k]![1] }));
     this.arrange();
   }
 
-  private add(spots: Spot[], text: string): Omit<Label, "width" | "height"> {
-    const content = make("span", { class: "place-label" }, text);
+  private add(spots: Spot[], text: string, kind: string): Omit<Label, "width" | "height"> {
+    const content = make("span", { class: kind }, text);
     const arrow = spots[0]!.direction === null ? null : make("span", { class: "place-arrow" }, "➤");
     if (arrow) content.prepend(arrow);
     const icon = L.divIcon({ className: "", html: content, iconSize: [0, 0] });

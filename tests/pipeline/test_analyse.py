@@ -50,6 +50,15 @@ def test_tables_and_lanes_are_valid_and_agree(folder: Path) -> None:
         assert -1 < y.min() <= y.max() < 221
 
 
+def test_the_map_of_the_page_has_the_names_that_the_tables_use(folder: Path) -> None:
+    record = AnalysisRecord.model_validate_json((folder / "analysis.json").read_bytes())
+    junctions = LanesRecord.model_validate_json((folder / "lanes.json").read_bytes()).junctions
+    places = {name.name: (name.x_px, name.y_px) for name in record.names}
+    assert {f"J{j.junction}": (j.x_px, j.y_px) for j in junctions}.items() <= places.items()
+    origins = next(table for table in record.tables if table.name == "origins")
+    assert {row.cells["from"] for row in origins.rows} <= set(places)
+
+
 def test_the_report_says_where_data_is_too_little(folder: Path) -> None:
     text = (folder / "report.html").read_text()
     assert "too little data" in text

@@ -10,7 +10,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisRow, AnalysisTable, EstimateRecord, GeometryRecord
+from schemas.analysis import (
+    AnalysisColumn,
+    AnalysisRecord,
+    AnalysisRow,
+    AnalysisTable,
+    EstimateRecord,
+    GeometryRecord,
+    NameRecord,
+)
 from schemas.arrays import IntArray
 from schemas.summary import RunSummary
 from schemas.view import ViewRecord
@@ -387,16 +395,18 @@ def made_analysis() -> AnalysisRecord:
 @NEEDS_PAGE
 def test_the_tab_of_the_analysis_shows_tables_with_n_and_intervals(chromium: Browser, linked: Path) -> None:
     (linked / "analysis").mkdir()
-    (linked / "analysis" / "analysis.json").write_text(made_analysis().model_dump_json())
+    names = {"directions": "N is north", "names": (NameRecord(name="J0", x_px=150, y_px=80),)}
+    (linked / "analysis" / "analysis.json").write_text(made_analysis().model_copy(update=names).model_dump_json())
     with served(linked) as there, chromium.page() as page:
         page.open(f"{there}#tab=analysis")
         page.wait("document.querySelector('#analysis tbody') !== null")
+        assert "(N is north)" in page.value("document.getElementById('analysis').textContent")
         cells = page.value("[...document.querySelectorAll('#analysis tbody td')].map((cell) => cell.textContent)")
         assert cells == ["●", "0", "36 32.4 to 41.4, n = 14", "", "1", "–"]
         titles = page.value("[...document.querySelectorAll('#analysis thead th')].map((cell) => cell.textContent)")
         assert titles == ["Map", "Lane", "Median speed, km/h"]
         labels = page.value("[...document.querySelectorAll('#map .place-label')].map((each) => each.textContent)")
-        assert labels == ["➤0"]  # the second row has no place
+        assert labels == ["J0", "➤0"]  # the second row has no place
         page.value("document.querySelector('#analysis .place').click()")
         assert page.value("document.getElementById('side').hidden")
         assert page.complaints == []

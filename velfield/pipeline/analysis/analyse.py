@@ -20,7 +20,7 @@ from velfield.analysis.vehicle_classes import find_classes
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
 from velfield.pipeline.analysis.clips import Frames, unusual_clips
-from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
+from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record, map_names
 from velfield.pipeline.analysis.tables import all_tables
 from velfield.pipeline.analysis.workbook import workbook_bytes
 from velfield.pipeline.given_tracks.load import SIZE_SD_M, load_tracks
@@ -211,6 +211,8 @@ def write_analysis(
         gsd_known=gsd_known,
         duration_s=round(analysis.trajectories.duration_s, 3),
         tracks=len(analysis.trajectories),
+        directions=analysis.arm_names.legend,
+        names=tuple(map_names(analysis)),
         answers=tuple(QuestionRecord(question=question, lines=lines) for question, lines in page.sections),
         tables=tuple(
             _with_clips(_explain_empty(table, analysis), clips) for table in all_tables(analysis, unit=speed_unit)

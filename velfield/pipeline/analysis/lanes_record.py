@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.analysis import ConnectionRecord, JunctionRecord, LaneRecord, LanesRecord, Point
+from schemas.analysis import ConnectionRecord, JunctionRecord, LaneRecord, LanesRecord, NameRecord, Point
 from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -55,6 +55,15 @@ def lanes_record(analysis: TrafficAnalysis, unit: SpeedUnit) -> LanesRecord:
             for junction in graph.junctions
         ),
     )
+
+
+def map_names(analysis: TrafficAnalysis) -> Iterator[NameRecord]:
+    """Names of the junctions, and of the roads by which vehicles enter and leave, with their places."""
+    named = [(f"J{junction.number}", junction.centre_m) for junction in analysis.lanes.junctions]
+    named += [(arm.name, arm.xy_m) for arm in analysis.scene.arms] if analysis.scene else []
+    for name, xy_m in named:
+        ((x, y),) = points_px(xy_m[None], analysis.trajectories.gsd_m)
+        yield NameRecord(name=name, x_px=x, y_px=y)
 
 
 def points_px(xy_m: FloatArray, gsd_m: float) -> tuple[Point, ...]:
