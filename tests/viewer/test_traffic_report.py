@@ -57,6 +57,9 @@ def test_of_lanes_that_merge_it_does_not_say_that_there_is_no_junction() -> None
     assert merging.movements
     answers = dict(first_page(merging).answers)
     assert answers["Is there a signal, and is it fair?"] == ("Not known: no junction was found where lanes cross.",)
+    assert answers["Where do vehicles go?"][-1] == (
+        "lanes only merge, each vehicle has one way to go: 18 vehicles at junction 0; see the table Turning counts"
+    )
 
 
 def test_every_diagram_is_drawn_and_two_pdfs_are_the_same(analysis: TrafficAnalysis) -> None:

@@ -149,6 +149,11 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
         subject = f"{_place(analysis, m.junction)}, {m.arm_in} to {m.arm_out}"
         text = f"{count_text(m.seen + m.inferred, 'vehicle')}{share}{delay}"
         yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
+    merges = [j for j in analysis.movements if kinds[j.junction.number] == "merge" and j.movements]
+    if merges:
+        at = [f"{count_text(j.volume, 'vehicle')} at junction {j.junction.number}" for j in merges]
+        text = f"lanes only merge, each vehicle has one way to go: {', '.join(at)}; see the table Turning counts"
+        yield Answer("merging", "", "found", text)
 
 
 def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:

@@ -71,18 +71,18 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     questions = (
         (
             "Where do vehicles go?",
-            found.get("movement", []) or found.get("through", []),
+            [*_few(found.get("movement") or found.get("through", [])), *found.get("merging", [])],
             "no turn was seen three times",
         ),
         (
             "Which approach waits longest, and how long are the queues?",
-            waits,
+            _few(waits),
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
-        ("Is there a signal, and is it fair?", found.get("signal", []), why("signal", no_signal)),
+        ("Is there a signal, and is it fair?", _few(found.get("signal", [])), why("signal", no_signal)),
         (
             "How fast do vehicles drive?",
-            found.get("speed", []) or found.get("mean speed", []),
+            _few(found.get("speed") or found.get("mean speed", [])),
             why("speed", "no lane was found"),
         ),
         ("Where is it dangerous?", events, f"conflicts: {why('conflicts', 'no lane was found')}"),
@@ -92,16 +92,15 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     seen = f"{count_text(n, 'vehicle')} that drive{'s' if n == 1 else ''} {MOVES_M:g} m or more, in {lasts}"
     return FirstPage(
         seen,
-        tuple(
-            (question, (*lines[:_PER_QUESTION], *_more(lines)) or (f"Not known: {why}.",))
-            for question, lines, why in questions
-        ),
+        tuple((question, tuple(lines) or (f"Not known: {why}.",)) for question, lines, why in questions),
         tuple(dict.fromkeys(withheld)),
     )
 
 
-def _more(lines: list[str]) -> tuple[str, ...]:
-    return (f"and {len(lines) - _PER_QUESTION} more, in the tables",) if len(lines) > _PER_QUESTION else ()
+def _few(lines: list[str]) -> list[str]:
+    """The first lines of an answer, and how many more there are."""
+    more = len(lines) - _PER_QUESTION
+    return [*lines[:_PER_QUESTION], f"and {more} more, in the tables"] if more > 0 else lines
 
 
 def _met(analysis: TrafficAnalysis) -> list[JunctionMovements]:
