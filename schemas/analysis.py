@@ -96,6 +96,8 @@ class AnalysisRecord(Model):
     duration_s: NonNegativeFloat
     tracks: NonNegativeInt
     """Tracks of moving vehicles that were analysed."""
+    seen: str = ""
+    """The same for people: which vehicles these are, and in which time."""
     level: float = Field(0.9, gt=0, lt=1)
     """Probability that an interval is to have."""
     directions: str = ""

@@ -2,7 +2,7 @@
 
 import { find, grid, make } from "./dom";
 import { Unreadable } from "./run";
-import type { Units } from "./units";
+import { countText, type Units } from "./units";
 
 const MAX_ROWS = 200; // shown of a table
 
@@ -42,8 +42,8 @@ interface Table {
 }
 
 interface Analysis {
-  duration_s: number;
   tracks: number;
+  seen?: string;
   level: number;
   gsd_known: boolean;
   directions?: string;
@@ -105,7 +105,8 @@ export class AnalysisPanel {
       find("table").focus();
     });
     const metres = analysis.gsd_known ? "" : " The scale is not known: lengths assume 0.23 m per pixel.";
-    const about = `${analysis.tracks} tracks of moving vehicles in ${analysis.duration_s.toFixed(0)} s. Grey: ${Math.round(100 * analysis.level)} % interval and n, the number of observations.${metres}`;
+    const seen = analysis.seen ?? countText(analysis.tracks, "vehicle");
+    const about = `${seen}. Grey: ${Math.round(100 * analysis.level)} % interval and n, the number of observations.${metres}`;
     const named = `J0 on the map is junction 0. Roads are named by where they lead to (${analysis.directions}).`;
     const names = analysis.names?.length ? [make("p", { class: "note" }, named)] : [];
     const note = make("p", { class: "note" }, table.note);

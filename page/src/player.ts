@@ -69,7 +69,7 @@ export class Player {
 const STATES: Record<string, string> = {
   moving: "in traffic",
   stopped: "stopped in a lane all the time that it was seen",
-  parked: "parked, or no vehicle",
+  parked: "stands throughout: a vehicle by its looks alone",
 };
 
 /** Class and length; nothing where the vehicle was not measured. */

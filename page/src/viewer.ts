@@ -247,7 +247,7 @@ class Viewer {
   private noteMoving(): void {
     const notes: string[] = [];
     if (this.state.replay !== null) {
-      notes.push("Replay: colour is speed, as in the layer Speed; grey is parked; pale is not detected. Click a vehicle.");
+      notes.push("Replay: colour is speed, as in the layer Speed; grey stands throughout, a vehicle by its looks alone; pale is not detected. Click a vehicle.");
     }
     if (this.state.flow) {
       const pace = this.flow.pace(this.animation.view().scale);

@@ -104,7 +104,7 @@ def test_movements_are_counted_by_class(analysis: TrafficAnalysis) -> None:
     (turn,) = [cells for where, cells in table.items() if where.endswith("W to S") and where.startswith("inter")]
     assert turn["lorry_or_bus"].value == pytest.approx(turn["vehicles"], rel=0.1)
     assert turn["measured"] == len(turning_tracks(analysis))
-    whole = table["all tracks that move"]
+    whole = table["all vehicles that drive"]
     assert whole["vehicles"] == len(analysis.trajectories)
     assert whole["lorry_or_bus"].low <= len(turning_tracks(analysis)) <= whole["lorry_or_bus"].high
     assert any(a.topic == "classes" and "lorry or bus" in a.text for a in find_answers(analysis))

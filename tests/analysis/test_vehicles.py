@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.analysis.vehicles import find_vehicles
+from velfield.analysis.vehicles import count_states, find_vehicles
 
 GSD_M = 0.25
 INTERVAL_S = 0.2
@@ -34,6 +34,11 @@ class Flight:
 
     def find(self) -> pd.DataFrame:
         return find_vehicles(pd.DataFrame(self.tracklets), pd.DataFrame(self.detections), gsd_m=GSD_M)
+
+
+def test_states_are_counted_and_of_what_is_parked_what_the_detector_is_sure_of() -> None:
+    made = pd.DataFrame({"state": ["moving", "parked", "parked", "parked"], "score": [0.01, 0.15, 0.3, 0.14]})
+    assert count_states(made) == {"moving": 1, "stopped": 0, "parked": 3, "parked_sure": 2}
 
 
 def with_lane() -> Flight:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from velfield import open_run
+from velfield.analysis.vehicles import SURE_SCORE
 from velfield.run.run import Run
 
 MARKS = Path(__file__).parents[1] / "data" / "kharkiv_marks.csv"
@@ -31,10 +32,17 @@ def main() -> None:
     print(f"frame {frame}: precision {precision:.3f}, recall {recall['all']:.3f}")
     for name in ("moving", "standing"):
         print(f"{name:9} recall {recall[name]:.3f}")
+    seen = run.track_positions().merge(run.vehicles()[["track_id", "state", "score"]], on="track_id")
+    seen = seen[seen["frame"] == frame]
+    parked = seen["state"] == "parked"
+    sure = seen["score"] >= SURE_SCORE
+    for name, rows in (("move or wait", ~parked), ("parked, sure", parked & sure), ("parked, others", parked & ~sure)):
+        print(f"tracks that are {name}: precision {judge(run, frame, seen[rows])[0]:.3f} of {rows.sum()}")
 
 
 def judge(run: Run, frame: int, found: pd.DataFrame) -> tuple[float, dict[str, float]]:
-    """Precision of detections in the marked frame, and the fraction found of ``all`` marks and by their kind."""
+    """Precision of detections, or of tracks' positions, in the marked frame, and the fraction found of ``all`` marks
+    and by their kind."""
     marks = pd.read_csv(MARKS)
     places = run.to_base(frame, marks[["x_px", "y_px"]].to_numpy(float))
     kind, unclear = marks["kind"].to_numpy(), (marks["kind"] == "unclear").to_numpy()

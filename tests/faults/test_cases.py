@@ -67,7 +67,7 @@ def test_case_01_a_left_turn_of_geotrax(tmp_path: Path) -> None:
 
 def test_case_09_fcd_in_degrees(tmp_path: Path) -> None:
     text = analysed("09", "fcd.xml", tmp_path)
-    assert "8 moving vehicles" in text
+    assert "8 vehicles that drive" in text
     assert "W to N" in text
 
 
@@ -87,7 +87,7 @@ def test_case_17_over_the_end_of_summer_time(tmp_path: Path) -> None:
 
 
 def test_case_22_two_recordings_in_one_table(tmp_path: Path) -> None:
-    assert "16 moving vehicles" in analysed("22", "tracks.csv", tmp_path, fps=10.0)
+    assert "16 vehicles that drive" in analysed("22", "tracks.csv", tmp_path, fps=10.0)
 
 
 def test_case_15_sumos_angles_are_in_the_frame_of_its_positions(tmp_path: Path) -> None:

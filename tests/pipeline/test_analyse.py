@@ -146,11 +146,13 @@ def test_a_short_clip_is_said_to_be_short(tmp_path: Path, capsys: pytest.Capture
     pd.DataFrame(rows, columns=["track_id", "time_s", "x_m", "y_m"]).to_csv(tmp_path / "t.csv", index=False)
     analyse(tracks=tmp_path / "t.csv", out=tmp_path / "out")
     text = capsys.readouterr().out
-    assert "4 moving vehicles in 6 s, too few" in text
+    assert "4 vehicles that drive 6 m or more, in 6 s: too few" in text
     assert re.search(r"u-turns +none was seen in 6 s, too short a time to say how rare they are", text)
     assert "an hour" not in text
     tables = AnalysisRecord.model_validate_json((tmp_path / "out" / "analysis.json").read_text()).tables
-    assert next(t for t in tables if t.name == "signals").note.startswith("Too little data: 4 moving vehicles in 6 s.")
+    assert next(t for t in tables if t.name == "signals").note.startswith(
+        "Too little data: 4 vehicles that drive 6 m or more, in 6 s."
+    )
 
 
 @pytest.mark.parametrize("gsd_m", [0.25, None])

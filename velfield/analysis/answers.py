@@ -13,6 +13,7 @@ from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import JunctionSignal, Queue, green_duration_s, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import MOVES_M, Trajectories
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 from velfield.errors import count_text
 
@@ -88,14 +89,18 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
     yield _unusual(analysis)
 
 
+def seen_text(tracks: Trajectories) -> str:
+    """The vehicles of an analysis, and in which time: ``130 vehicles that drive 6 m or more, in 7 s``."""
+    drive = f"that drive{'s' if len(tracks) == 1 else ''} {MOVES_M:g} m or more"
+    return f"{count_text(len(tracks), 'vehicle')} {drive}, in {duration_text(tracks.duration_s)}"
+
+
 def too_short(analysis: TrafficAnalysis) -> str:
     """Explanation that a clip has too few moving vehicles for most questions, with their number and its duration."""
-    tracks, seconds = len(analysis.trajectories), analysis.trajectories.duration_s
-    lacks = "too few" if tracks < _FEW_TRACKS else "too short"
+    lacks = "few" if len(analysis.trajectories) < _FEW_TRACKS else "short"
     return (
-        f"{count_text(tracks, 'moving vehicle')} in {duration_text(seconds)}, {lacks} for most questions: a "
-        "movement takes 3 vehicles, a free-flow speed 8 that nothing slows down, a flow one minute, "
-        "a signal two whole cycles"
+        f"{seen_text(analysis.trajectories)}: too {lacks} for most questions; a movement takes 3 vehicles, a free-flow "
+        "speed 8 that nothing slows down, a flow one minute, a signal two whole cycles"
     )
 
 
@@ -105,13 +110,12 @@ def explain_none(topic: str, analysis: TrafficAnalysis) -> str:
     if topic in ("u_turns", "conflicts", "unusual"):
         return f"{_events(topic, 0, seconds).text.capitalize()}."
     if seconds < _SHORT_S or tracks < _FEW_TRACKS:
-        return f"Too little data: {count_text(tracks, 'moving vehicle')} in {duration_text(seconds)}."
+        return f"Too little data: {seen_text(analysis.trajectories)}."
     return "None found."
 
 
 def _lanes(analysis: TrafficAnalysis) -> Answer:
-    graph, tracks = analysis.lanes, analysis.trajectories
-    seen = f"{count_text(len(tracks), 'moving vehicle')} in {duration_text(tracks.duration_s)}"
+    graph, seen = analysis.lanes, seen_text(analysis.trajectories)
     if not len(graph):
         return Answer("lanes", "", "too little data", f"too little data: no lane that three of {seen} drove")
     crossings = sum(analysis.junction_kind(k) == "crossing" for k in range(len(graph.junctions)))

@@ -18,6 +18,9 @@ from velfield.tracking.doubtful import MOVED_M, end_means
 STATES = ("moving", "stopped", "parked")
 """``moving``: at some time; ``stopped``: never, but in a lane that others drive or queue in; ``parked``: never, and in
 none, or no vehicle at all."""
+SURE_SCORE = 0.15
+"""Of the parked ones with this mean score, by the shipped network, or more, 15 of 18 in a frame of a clip of 1080p are
+vehicles, and 83 of 83 in a simulated city; of those with less 24 of 64, and 2 of 7."""
 _MOVED_SIGMAS = 4.0
 """A shorter one counts where it is so many standard deviations, at more than a stationary vehicle's speed."""
 _CELL_M, _SECTOR_RAD = 0.5, np.pi / 12
@@ -40,6 +43,13 @@ VEHICLE_COLUMNS = (
     *(f"{name}_{k}" for k in range(3) for name in ("frame", "detection_id")),
 )
 """Columns of tracklets that `find_vehicles` reads."""
+
+
+def count_states(vehicles: pd.DataFrame) -> dict[str, float]:
+    """Number of vehicles (`find_vehicles`) in each of `STATES`; ``parked_sure``: parked, with `SURE_SCORE` or more."""
+    counts = {name: float((vehicles["state"] == name).sum()) for name in STATES}
+    sure = (vehicles["state"] == "parked") & (vehicles["score"] >= SURE_SCORE)
+    return {**counts, "parked_sure": float(sure.sum())}
 
 
 def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: float | None) -> pd.DataFrame:

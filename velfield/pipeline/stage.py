@@ -333,9 +333,14 @@ STAGES: tuple[Stage, ...] = (
     # Figures, layers for GIS, the data of the viewer.
     Stage(
         name="maps",
-        version=5,
+        version=6,
         label="maps",
-        lines=(Line("{maps:.0f} maps"),),
+        lines=(
+            Line(
+                "{maps:map}; of the tracks {moving:.0f} move, {stopped:.0f} wait in a lane, {parked:.0f} stand "
+                "throughout (vehicles by their looks alone)"
+            ),
+        ),
         unit=f"{_STAGES}.maps:make_maps",
         after=("field",),
         new_workers=True,

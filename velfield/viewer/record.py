@@ -22,7 +22,7 @@ from velfield.analysis.coverage import low_coverage_note
 from velfield.analysis.crossings import hysteresis_px
 from velfield.analysis.intervals import vehicles_for_quantile
 from velfield.analysis.vehicle_classes import CLASS_NAMES
-from velfield.analysis.vehicles import STATES
+from velfield.analysis.vehicles import STATES, count_states
 from velfield.field.segments import Segments, band_radius_px, stationary_speed_px_per_s
 from velfield.field.statistics import PERCENTILES
 from velfield.run.commits import record_page, write_atomically
@@ -46,8 +46,13 @@ _LINE_RADIUS_PX = 1.5
 """Around a path that is one pixel wide."""
 
 
-def write_view_data(layout: RunLayout) -> list[Path]:
-    """Write the tiles of the base image and the segments; returns the files."""
+def write_view_data(layout: RunLayout) -> tuple[list[Path], dict[str, float]]:
+    """Write the tiles of the base image, the segments and the animations.
+
+    Returns
+    -------
+    The files, and the number of vehicles by state (`count_states`).
+    """
     run = open_run(layout.root)
     remove_tree(layout.view / "base")  # tiles of an earlier, larger base image
     written = []
@@ -59,7 +64,7 @@ def write_view_data(layout: RunLayout) -> list[Path]:
     segments = run.segments()
     write_segments(layout.view_segments, _columns(segments))
     written += sorted(path for path in layout.view_segments.rglob("*") if path.is_file())
-    return written + _write_animations(run, segments, vehicles)
+    return written + _write_animations(run, segments, vehicles), count_states(vehicles)
 
 
 def _write_animations(run: Run, segments: Segments, vehicles: pd.DataFrame) -> list[Path]:

@@ -79,7 +79,7 @@ def _facts(run: Run, options: ExportOptions) -> list[str]:
     count = run.field.count()
     facts = [_date(run, options), f"{seconds:.0f} s of video"]
     facts += [f"n = {int((states != 'parked').sum())} vehicles move or wait in a lane"]
-    facts += [f"{int((states == 'parked').sum())} stand throughout, parked or no vehicles"]
+    facts += [f"{int((states == 'parked').sum())} more stand throughout, vehicles by their looks alone"]
     if (count > 0).any():
         facts += [f"median of {float(np.median(count[count > 0])):.0f} vehicles at a coloured pixel"]
     return facts

@@ -128,7 +128,9 @@ class _Scene:
             )
         scale = MapScale(gsd_m=run.grid.gsd_m, unit=options.unit, north_rad=shown.scale.north_rad)
         top = round_up(colour_scale_max(scale.shown_speed(speed)) or 10.0)
-        note = "Boxes: vehicles, at their speed; grey: parked. Lanes, paler: the speed of most vehicles."
+        note = (
+            "Boxes: vehicles, at their speed; grey: what stands throughout. Lanes, paler: the speed of most vehicles."
+        )
         title = f"Speed, {scale.shown_unit}"
         legend = Legend(title, note, "speed", top, shown.scale.gsd_m, shown.scale.north_rad)
         panel = legend_panel(shown.grey.shape, legend)

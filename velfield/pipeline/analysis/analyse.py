@@ -211,6 +211,7 @@ def write_analysis(
         gsd_known=gsd_known,
         duration_s=round(analysis.trajectories.duration_s, 3),
         tracks=len(analysis.trajectories),
+        seen=page.seen,
         directions=analysis.arm_names.legend,
         names=tuple(map_names(analysis)),
         answers=tuple(QuestionRecord(question=question, lines=lines) for question, lines in page.sections),

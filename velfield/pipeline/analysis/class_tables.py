@@ -59,7 +59,7 @@ def _groups(analysis: TrafficAnalysis, classes: VehicleClasses) -> Iterator[_Gro
         return _Group(kind, name, vehicles, measured, classes.estimate_shares(tracks), place_m)
 
     n = len(analysis.trajectories)
-    yield group("picture", "all tracks that move", float(n), np.arange(n), None)
+    yield group("picture", "all vehicles that drive", float(n), np.arange(n), None)
     for found in analysis.movements:
         for m in found.movements:
             name = f"{analysis.junction_kind(m.junction)} {m.junction}, {m.arm_in} to {m.arm_out}"

@@ -97,7 +97,8 @@ def car_park_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("time", "Time inside", "s", lambda park: park.time_s),
     ]
     note = (
-        "Areas of six parked vehicles or more, 10 m wide or more, kerbs left out, and who drives 15 m or more in them."
+        "Areas of six parked vehicles or more, 10 m wide or more, kerbs left out, and who drives 15 m or more in them. "
+        "Only looks tell that what never moves is a vehicle: roof gear, sheds and trees may be among the parked ones."
     )
     if analysis.parked is None:
         note = "Parked vehicles are not known of these tracks."

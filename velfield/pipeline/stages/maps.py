@@ -39,16 +39,23 @@ def make_maps(plan: Plan) -> StageResult:
         # One map after the other, each of the few pixels that vehicles passed: whole layers of float64 fill the memory.
         return [*_write_direction(plan, scale, slow), *_write_speed(plan, scale)]
 
+    counts = {"maps": 2.0}
+
+    def write_view() -> list[Path]:
+        written, states = write_view_data(layout)
+        counts.update(states)
+        return written
+
     # The viewer's data take about as long as the figures of the field.
     writers: list[Callable[[], list[Path]]] = [
         write_figures,
-        partial(write_view_data, layout),
+        write_view,
         partial(_write_quality_figures, plan),
     ]
     with ignore_missing_georeference():
         written = parallel_map(lambda write: write(), writers)
     advance("maps")
-    return StageResult([path for paths in written for path in paths], {"maps": 2.0})
+    return StageResult([path for paths in written for path in paths], counts)
 
 
 def _modal_velocity(plan: Plan) -> tuple[Mask, FloatArray]:

@@ -4,12 +4,11 @@ from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
 
-from velfield.analysis.answers import duration_text
+from velfield.analysis.answers import seen_text
 from velfield.analysis.changes import FDR_LEVEL, Change, common_junctions
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.errors import count_text
 from velfield.report.drawing import figure_bytes, new_figure
 from velfield.report.traffic.report import DPI, STYLE
 from velfield.report.traffic.turning import draw_turning
@@ -51,10 +50,11 @@ def before_after_html(
         for c in changes
     )
     heads = "".join(f"<th>{head}</th>" for head in ("Quantity", "Before", "After", "p", "More than chance"))
+    seen = [seen_text(analysis.trajectories) for analysis in (before, after)]
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Before and after</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head><body>'
-        f'<h1>Before and after</h1><p class="seen">Before: {_seen(before)}. After: {_seen(after)}.</p>'
+        f'<h1>Before and after</h1><p class="seen">Before: {seen[0]}. After: {seen[1]}.</p>'
         f"<h2>What changed</h2><p>{len(real)} of {len(changes)} comparisons of junctions and roads.</p>{verdict}"
         "<p class='note'>In brackets: the 90 % interval, and n. Of the changes that are listed some "
         f"{FDR_LEVEL:.0%} are chance (false discovery rate).</p>{pictures}{figures}"
@@ -85,11 +85,6 @@ def _text(estimate: Estimate, factor: float) -> str:
 def _cell(estimate: Estimate, of: str) -> str:
     factor, unit = _UNITS.get(of, (1.0, of))
     return f"<td>{escape(_text(estimate, factor))} {escape(unit)}</td>"
-
-
-def _seen(analysis: TrafficAnalysis) -> str:
-    n = len(analysis.trajectories)
-    return f"{count_text(n, 'moving vehicle')} in {duration_text(analysis.trajectories.duration_s)}"
 
 
 def _turns(old: JunctionMovements, new: JunctionMovements) -> str:

@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import duration_text, find_answers, longest_queues, queue_text
+from velfield.analysis.answers import find_answers, longest_queues, queue_text, seen_text
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import Queue
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.trajectories import MOVES_M
 from velfield.errors import count_text
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, compare_delays
 
@@ -87,11 +86,8 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
         ),
         ("Where is it dangerous?", events, f"conflicts: {why('conflicts', 'no lane was found')}"),
     )
-    n = len(analysis.trajectories)
-    lasts = duration_text(analysis.trajectories.duration_s)
-    seen = f"{count_text(n, 'vehicle')} that drive{'s' if n == 1 else ''} {MOVES_M:g} m or more, in {lasts}"
     return FirstPage(
-        seen,
+        seen_text(analysis.trajectories),
         tuple((question, tuple(lines) or (f"Not known: {why}.",)) for question, lines, why in questions),
         tuple(dict.fromkeys(withheld)),
     )
