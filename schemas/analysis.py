@@ -45,6 +45,8 @@ class AnalysisColumn(Model):
     """Key of its cells."""
     title: str
     unit: str = ""
+    unknown: bool = False
+    """There are rows, and no number in any; the report and the page name such columns alone."""
 
 
 class AnalysisRow(Model):
@@ -52,6 +54,8 @@ class AnalysisRow(Model):
 
     cells: dict[str, Cell]
     geometry: GeometryRecord | None = None
+    unknown: bool = False
+    """There is no number in it; the report and the page count such rows alone."""
 
 
 class AnalysisTable(Model):

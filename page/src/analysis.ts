@@ -30,6 +30,7 @@ type Cell = Estimate | boolean | number | string | null;
 interface Row {
   cells: Record<string, Cell>;
   geometry: Geometry | null;
+  unknown?: boolean;
 }
 
 interface Table {
@@ -37,7 +38,7 @@ interface Table {
   section: string;
   title: string;
   note: string;
-  columns: { name: string; title: string; unit: string }[];
+  columns: { name: string; title: string; unit: string; unknown?: boolean }[];
   rows: Row[];
 }
 
@@ -87,7 +88,12 @@ export class AnalysisPanel {
   }
 
   private render(analysis: Analysis): void {
-    const table = analysis.tables[this.table]!;
+    const whole = analysis.tables[this.table]!;
+    const isKnown = ({ unknown }: { unknown?: boolean }): boolean => !unknown;
+    const table = { ...whole, rows: whole.rows.filter(isKnown), columns: whole.columns.filter(isKnown) };
+    const rows = whole.rows.length - table.rows.length;
+    const columns = whole.columns.filter(({ unknown }) => unknown).map(({ title }) => `“${title}”`);
+    const leftOut = [...(rows ? [countText(rows, "row")] : []), ...columns];
     const choice = make("select", { id: "table" });
     for (const section of new Set(analysis.tables.map((each) => each.section))) {
       const group = make("optgroup", { label: section });
@@ -112,7 +118,10 @@ export class AnalysisPanel {
     const note = make("p", { class: "note" }, table.note);
     const answers = (analysis.answers ?? []).flatMap(({ question, lines }) => [make("dt", {}, question), ...lines.map((line) => make("dd", {}, line))]);
     const content: HTMLElement[] = [make("p", { class: "note" }, about), ...names, make("dl", { class: "answers" }, ...answers), make("label", {}, "Table ", choice), note];
-    content.push(table.rows.length ? this.rows(analysis, table) : make("p", {}, "Nothing of this kind was found."));
+    if (table.rows.length) content.push(this.rows(analysis, table));
+    else if (!rows) content.push(make("p", {}, "Nothing of this kind was found."));
+    const left = `Not known, and left out here (analysis/analysis.xlsx has all): ${leftOut.join(", ")}.`;
+    if (leftOut.length) content.push(make("p", { class: "note" }, left));
     if (table.rows.length > MAX_ROWS) content.push(make("p", { class: "note" }, `and ${table.rows.length - MAX_ROWS} more, in analysis/analysis.json`));
     find("analysis-content").replaceChildren(...content);
     this.draw(places(analysis, table), null);

@@ -383,10 +383,12 @@ def made_analysis() -> AnalysisRecord:
             cells={"lane": 0, "speed": speed}, geometry=GeometryRecord(type="LineString", xy_px=((9, 9), (90, 9)))
         ),
         AnalysisRow(cells={"lane": 1, "speed": EstimateRecord(n=1)}),
+        AnalysisRow(cells={"lane": 2, "speed": EstimateRecord()}, unknown=True),
     )
     columns = (
         AnalysisColumn(name="lane", title="Lane"),
         AnalysisColumn(name="speed", title="Median speed", unit="m/s"),
+        AnalysisColumn(name="headway", title="Headway", unit="s", unknown=True),
     )
     table = AnalysisTable(name="speeds", section="Speed", title="Speeds", note="A note.", columns=columns, rows=rows)
     return AnalysisRecord(code_version="0", gsd_m=0.23, gsd_known=True, duration_s=8, tracks=15, tables=(table,))
@@ -405,6 +407,8 @@ def test_the_tab_of_the_analysis_shows_tables_with_n_and_intervals(chromium: Bro
         assert cells == ["●", "0", "36 32.4 to 41.4, n = 14", "", "1", "–"]
         titles = page.value("[...document.querySelectorAll('#analysis thead th')].map((cell) => cell.textContent)")
         assert titles == ["Map", "Lane", "Median speed, km/h"]
+        left_out = "Not known, and left out here (analysis/analysis.xlsx has all): 1 row, “Headway”."
+        assert left_out in page.value("document.getElementById('analysis').textContent")
         labels = page.value("[...document.querySelectorAll('#map .place-label')].map((each) => each.textContent)")
         assert labels == ["J0", "➤0"]  # the second row has no place
         page.value("document.querySelector('#analysis .place').click()")

@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from schemas.analysis import EstimateRecord
+from schemas.analysis import AnalysisRecord, EstimateRecord
 from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, drive, gather
 from velfield.analysis.answers import duration_text
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.pipeline.analysis.tables import all_tables, limit_table
+from velfield.pipeline.analysis.tables import all_tables, flow_table, limit_table
 from velfield.report.drawing import new_figure, pages_bytes
 from velfield.report.traffic.approaches import approach_delays, lane_names
 from velfield.report.traffic.diagrams import draw_queues, draw_time_space, red_times, traffic_diagrams
-from velfield.report.traffic.first_page import first_page
+from velfield.report.traffic.first_page import FirstPage, first_page
+from velfield.report.traffic.report import report_html
 
 __all__ = ["analysis"]
 
@@ -47,6 +48,18 @@ def test_a_short_clip_is_answered_by_what_is_missing() -> None:
         (f"Not known: conflicts: none was seen in {seconds}, too short a time to say how rare they are.",),
     ]
     assert {d.name for d in traffic_diagrams(short, None)} <= {"place", "speed-profile"}
+
+
+def test_rows_and_columns_without_a_number_are_one_line_of_the_report() -> None:
+    busy, quiet = (np.array([[0.0, y], [100.0, y]]) for y in (10.0, 40.0))
+    drives = [drive(busy, 4.0 * k) for k in range(8)] + [drive(quiet, 4.0 * k) for k in range(3)]
+    flow = flow_table(TrafficAnalysis(gather(drives)))
+    assert [row.unknown for row in flow.rows] == [False, True]
+    assert [column.name for column in flow.columns if column.unknown] == ["flow", "density", "gap"]
+    record = AnalysisRecord(code_version="", gsd_m=1, gsd_known=True, duration_s=30, tracks=11, tables=(flow,))
+    html = report_html(record, FirstPage("", (), ()), [])
+    assert html.count("<td") == 3  # the lane, its speed, its headway
+    assert "left out here (analysis.xlsx has all): 1 row, “Flow”, “Density”, “Gap of those that follow”." in html
 
 
 def test_of_lanes_that_merge_it_does_not_say_that_there_is_no_junction() -> None:

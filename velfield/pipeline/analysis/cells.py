@@ -51,26 +51,42 @@ def make_table(
     place_m: Callable[[T], FloatArray | None],
     *,
     is_area: bool = False,
+    named_by: int = 1,
 ) -> AnalysisTable:
     """A table with a row for each item.
 
     ``place_m`` gives its place on the map, m: a point (2,), a line (n, 2) or, with ``is_area``, the corners (n, 2) of
-    an area; None without one.
+    an area; None without one. ``named_by``: so many columns, the first, say what a row is of; others, and
+    rows, are ``unknown`` where no number is in them.
     """
     gsd_m = analysis.trajectories.gsd_m
 
     def row(item: T) -> AnalysisRow:
         geometry = _geometry(place_m(item), gsd_m, is_area=is_area)
-        return AnalysisRow(cells={c.key: c.cell(item) for c in columns}, geometry=geometry)
+        cells = {c.key: c.cell(item) for c in columns}
+        unknown = all(map(_is_unknown, list(cells.values())[named_by:])) and len(cells) > named_by
+        return AnalysisRow(cells=cells, geometry=geometry, unknown=unknown)
+
+    rows = tuple(map(row, items))
+
+    def is_unknown(key: str) -> bool:
+        return bool(rows) and all(_is_unknown(one.cells[key]) for one in rows)
 
     return AnalysisTable(
         name=name,
         section=section,
         title=title,
         note=note,
-        columns=tuple(AnalysisColumn(name=c.key, title=c.title, unit=c.unit) for c in columns),
-        rows=tuple(map(row, items)),
+        columns=tuple(
+            AnalysisColumn(name=c.key, title=c.title, unit=c.unit, unknown=k >= named_by and is_unknown(c.key))
+            for k, c in enumerate(columns)
+        ),
+        rows=rows,
     )
+
+
+def _is_unknown(cell: Cell) -> bool:
+    return cell is None or (isinstance(cell, EstimateRecord) and cell.value is None)
 
 
 def _geometry(xy_m: FloatArray | None, gsd_m: float, *, is_area: bool) -> GeometryRecord | None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.analysis import AnalysisTable, Cell
 from schemas.arrays import FloatArray, IntArray
-from velfield.analysis.intervals import Estimate
+from velfield.analysis.intervals import MIN_VEHICLES, Estimate
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES, VehicleClasses
 from velfield.pipeline.analysis.cells import Column, estimate_cell, make_table
@@ -44,13 +44,16 @@ def class_table(analysis: TrafficAnalysis) -> AnalysisTable:
     note = (
         "By the shares of the classes under which the measured lengths and widths are most likely: a vehicle whose "
         "dimensions fit two classes counts in part for either. Intervals are of the shares in the long run, and wider "
-        "where dimensions do not separate the classes. Vehicles that were not measured are taken to be as the others."
+        "where dimensions do not separate the classes. Vehicles that were not measured are taken to be as the others. "
+        f"Counts take {MIN_VEHICLES} measured vehicles."
     )
     if analysis.classes is None:
         note = "Lengths and widths in metres are not known of these tracks."
     rows = _groups(analysis, analysis.classes) if analysis.classes else ()
     title = "Vehicles by class"
-    return make_table(analysis, "classes", "Movements", title, note, columns, rows, lambda group: group.place_m)
+    return make_table(
+        analysis, "classes", "Movements", title, note, columns, rows, lambda group: group.place_m, named_by=4
+    )
 
 
 def _groups(analysis: TrafficAnalysis, classes: VehicleClasses) -> Iterator[_Group]:

@@ -11,6 +11,7 @@ from velfield.analysis.answers import TWO_LEVELS
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
 from velfield.analysis.flow.volume import LaneFlow, delay_level
+from velfield.analysis.intervals import MIN_VEHICLES
 from velfield.analysis.lanes.model import Lane
 from velfield.analysis.movements.movements import JunctionMovements, Movement
 from velfield.analysis.movements.reversals import Reversal
@@ -149,8 +150,9 @@ def limit_table(analysis: TrafficAnalysis, unit: SpeedUnit = "km/h") -> Analysis
         estimates("p85", "Free-flow speed p85", "km/h", lambda road: road.p85_m_per_s, KM_PER_H),
     ]
     note = (
-        "Median speed of vehicles that keep their speed over 30 m, 4 s and more behind the one before; speeds of those "
-        f"that follow within 3 s are lower bounds. The limit is the multiple of {SIGNS[unit]:g} {unit} nearest to it."
+        "Median speed of vehicles, 8 or more, that keep their speed over 30 m, 4 s and more behind the one before; "
+        f"speeds of those that follow within 3 s are lower bounds. The limit is the multiple of {SIGNS[unit]:g} {unit} "
+        "nearest to it."
     )
     return make_table(
         analysis, "free_flow", "Speed", "Free flow and speed limit", note, columns, analysis.free_flow,
@@ -169,10 +171,10 @@ def reduction_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("after", "Speed after", "km/h", lambda r: r.after_m_per_s, KM_PER_H),
         estimates("recovery", "Recovers over", "m", lambda r: r.recovery_m),
     ]
-    note = "Of vehicles that neither stop nor give way."
+    note = f"Of vehicles that neither stop nor give way; {MIN_VEHICLES} are needed."
     return make_table(
         analysis, "speed_reduction", "Speed", "Speed reduction at junctions", note, columns, analysis.reductions,
-        lambda r: analysis.lanes.junctions[r.junction].centre_m,
+        lambda r: analysis.lanes.junctions[r.junction].centre_m, named_by=2,
     )  # fmt: skip
 
 
@@ -244,7 +246,10 @@ def flow_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("headway", "Headway", "s", lambda flow: flow.headway_s),
         estimates("gap", "Gap of those that follow", "s", lambda flow: flow.gap_s),
     ]
-    note = "Density and speed by Edie's definitions over the lane; flow and headways at its middle."
+    note = (
+        "Density and speed by Edie's definitions over the lane; flow and headways at its middle. "
+        f"Each takes {MIN_VEHICLES} vehicles, a flow and a density a minute, too."
+    )
     return make_table(
         analysis, "flow", "Flow", "Flow by lane", note, columns, analysis.flows,
         lambda flow: analysis.lanes.lanes[flow.lane].xy_m,

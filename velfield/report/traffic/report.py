@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from schemas.analysis import AnalysisRecord, AnalysisTable, Cell, EstimateRecord
 from schemas.flight import PAPER_GSD_M
+from velfield.errors import count_text
 from velfield.report.drawing import figure_bytes, new_figure, pages_bytes
 from velfield.report.traffic.diagrams import WIDTH_IN, Diagram
 from velfield.report.traffic.first_page import FirstPage
@@ -147,12 +148,15 @@ def _place(figure: "Figure", diagram: Diagram, top_in: float) -> float:
 
 
 def _table(table: AnalysisTable) -> str:
-    heads = "".join(f"<th>{escape(c.title)}{f', {escape(c.unit)}' if c.unit else ''}</th>" for c in table.columns)
-    rows = "".join(
-        f"<tr>{''.join(_cell(row.cells.get(c.name)) for c in table.columns)}</tr>" for row in table.rows[:MAX_ROWS]
-    )
-    more = f"<p>{len(table.rows) - MAX_ROWS} more rows in analysis.json.</p>" if len(table.rows) > MAX_ROWS else ""
-    body = f'<div class="scroll"><table><tr>{heads}</tr>{rows}</table></div>{more}' if table.rows else ""
+    known, columns = [row for row in table.rows if not row.unknown], [c for c in table.columns if not c.unknown]
+    heads = "".join(f"<th>{escape(c.title)}{f', {escape(c.unit)}' if c.unit else ''}</th>" for c in columns)
+    rows = "".join(f"<tr>{''.join(_cell(row.cells.get(c.name)) for c in columns)}</tr>" for row in known[:MAX_ROWS])
+    more = f"<p>{len(known) - MAX_ROWS} more rows in analysis.json.</p>" if len(known) > MAX_ROWS else ""
+    left_out = [count_text(n, "row")] if (n := len(table.rows) - len(known)) else []
+    left_out += [f"“{escape(c.title)}”" for c in table.columns if c.unknown]
+    if left_out:
+        more += f"<p>Not known, and left out here (analysis.xlsx has all): {', '.join(left_out)}.</p>"
+    body = (f'<div class="scroll"><table><tr>{heads}</tr>{rows}</table></div>' if known else "") + more
     return (
         f'<details id="{table.name}"><summary>{escape(table.title)} ({len(table.rows)})</summary>'
         f'<p class="note">{escape(table.note)}</p>{body}</details>'
