@@ -33,7 +33,7 @@ def main() -> None:
     for name in ("moving", "standing"):
         print(f"{name:9} recall {recall[name]:.3f}")
     seen = run.track_positions().merge(run.vehicles()[["track_id", "state", "score"]], on="track_id")
-    seen = seen[seen["frame"] == frame]
+    seen = seen[(seen["frame"] == frame) & (seen["source"] != "interpolated")]
     parked = seen["state"] == "parked"
     sure = seen["score"] >= SURE_SCORE
     for name, rows in (("move or wait", ~parked), ("parked, sure", parked & sure), ("parked, others", parked & ~sure)):
