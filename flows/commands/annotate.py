@@ -19,7 +19,8 @@ def annotate(
     Parameters
     ----------
     place
-        Image of a frame, or a run folder: then frames spread over its flight are shown.
+        Image of a frame, or a run folder: then frames spread over its flight are shown, with the vehicles that the run
+        tracks as marks to correct.
     labels
         CSV file to write; its labels of other frames are kept.
         Default: `labels.csv` in the run folder, or next to the image.

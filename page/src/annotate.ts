@@ -13,6 +13,8 @@ interface ServerData extends Served {
   labels: string;
   names: string[];
   marks: { frames: string[]; cars: Car[] };
+  /** Of frames that are not labelled: what they begin with. */
+  found: Car[];
 }
 
 const MIN_DRAG_PX = 4; // screen px: a shorter drag is a click
@@ -25,13 +27,15 @@ class Annotator {
   private cars: Car[];
   private readonly empty: Set<string>; // frames marked as empty
   private readonly touched: Set<string>; // frames that are or were labelled
+  private readonly offered: Set<string>; // frames whose marks are the run's: no labels until one is changed, or all confirmed
   private selected: Car | null = null;
   private from: L.LatLng | null = null;
   private ratio = DEFAULT_RATIO;
   private saving: Promise<void> = Promise.resolve();
 
   constructor(private readonly data: ServerData) {
-    this.cars = data.marks.cars;
+    this.cars = [...data.marks.cars, ...data.found];
+    this.offered = new Set(data.found.map(({ frame }) => frame));
     this.empty = new Set(data.marks.frames.filter((name) => !this.cars.some((car) => car.frame === name)));
     this.touched = new Set(data.marks.frames);
     this.map = imageMap(data, { dragging: false, keyboard: false });
@@ -74,7 +78,10 @@ class Annotator {
     const width = find<HTMLInputElement>("width");
     width.disabled = this.selected === null;
     width.value = this.selected?.width_px?.toFixed(1) ?? "";
-    this.showStatus(`${countText(here.length, "car")} in this frame`);
+    const offered = this.offered.has(this.name);
+    find("confirm").hidden = !offered;
+    const by = offered ? ", found by the run and not saved: remove what is no car, add what is missing" : "";
+    this.showStatus(`${countText(here.length, "car")} in this frame${by}`);
   }
 
   private showStatus(text: string): void {
@@ -141,18 +148,20 @@ class Annotator {
   // -- saving ----------------------------------------------------------------------------------------------------------
 
   private changed(): void {
+    this.offered.delete(this.name);
     if (this.cars.some((car) => car.frame === this.name)) this.empty.delete(this.name);
     this.draw();
     this.saving = this.saving.then(() => this.save()).catch((error) => this.showStatus(`NOT saved: ${error.message}`));
   }
 
   private async save(): Promise<void> {
-    const labelled = new Set([...this.empty, ...this.cars.map((car) => car.frame)]);
+    const labels = this.cars.filter((car) => !this.offered.has(car.frame));
+    const labelled = new Set([...this.empty, ...labels.map((car) => car.frame)]);
     labelled.forEach((name) => this.touched.add(name));
     const frames = this.data.names.filter((name) => labelled.has(name));
     // A frame that lost its last car, and is not marked as empty, is no longer labelled.
     const cleared = [...this.touched].filter((name) => !labelled.has(name));
-    const { cars } = await post<{ cars: number }>(this.data, "labels", { frames, cleared, cars: this.cars });
+    const { cars } = await post<{ cars: number }>(this.data, "labels", { frames, cleared, cars: labels });
     this.showStatus(`saved: ${countText(cars, "car")} in ${this.data.labels}`);
   }
 
@@ -168,6 +177,7 @@ class Annotator {
     find("next").addEventListener("click", () => this.show(this.frame + 1));
     find("remove").addEventListener("click", () => this.remove());
     find("none").addEventListener("click", () => this.toggleEmpty());
+    find("confirm").addEventListener("click", () => this.changed());
     const move = find<HTMLInputElement>("move");
     move.addEventListener("change", () => this.setDragging(move.checked));
     const width = find<HTMLInputElement>("width");

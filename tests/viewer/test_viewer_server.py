@@ -21,6 +21,7 @@ from schemas.summary import RunSummary
 from tests.browser import NEEDS_PAGE, browser
 from velfield.errors import InputError
 from velfield.report.figures import png_bytes
+from velfield.run.run import open_run
 from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.viewer.annotations import Frames, frames_to_annotate, read_marks, write_marks
@@ -257,6 +258,36 @@ def test_a_run_offers_frames_spread_over_the_flight(whole: tuple[Path, RunSummar
     assert len(offered.names) == 4
     assert (offered.names[0], offered.names[-1]) == (names[0], names[-1])
     assert offered.read(1).shape == (offered.height, offered.width) == (480, 640)
+
+
+def test_a_frame_begins_with_the_vehicles_that_the_run_tracks(whole: tuple[Path, RunSummary]) -> None:
+    run, offered = open_run(whole[0]), frames_to_annotate(whole[0], max_frames=4)
+    seen = run.track_positions()
+    seen = seen[(seen["frame"] == 0) & (seen["source"] != "interpolated")]
+    seen = seen.merge(run.vehicles()[["track_id", "length_px"]], on="track_id")
+    cars = [car for car in offered.found if car.frame == offered.names[0]]
+    assert 0.9 * len(seen) <= len(cars) <= len(seen)
+    places = run.to_base(0, np.array([[car.x_px, car.y_px] for car in cars]))
+    away = np.hypot(*(places[:, None] - seen[["x_px", "y_px"]].to_numpy()[None]).transpose(2, 0, 1))
+    assert away.min(axis=1).max() < 0.5
+    longer = [car.length_px / seen["length_px"].iloc[k] for car, k in zip(cars, away.argmin(axis=1), strict=True)]
+    assert 0.8 < np.nanmedian(longer) < 1.25  # of the frame's pixels, not of the map's
+
+
+@NEEDS_PAGE
+def test_what_the_run_found_is_no_label_before_it_is_confirmed(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+    labels = tmp_path / "labels.csv"
+    arguments = ("annotate", str(whole[0]), "--labels", str(labels), "--frames", "2")
+    with command(*arguments) as address, browser(tmp_path / "profile") as chromium, chromium.page() as page:
+        page.open(address)
+        page.wait("document.getElementById('saved').textContent.includes('found by the run and not saved')")
+        count = int(page.value("document.getElementById('saved').textContent").split()[0])
+        assert not labels.exists()
+        page.value("document.getElementById('confirm').click()")
+        page.wait(f"document.getElementById('saved').textContent.startsWith('saved: {count}')")
+        assert page.value("document.getElementById('confirm').hidden")
+        assert page.complaints == []
+    assert pd.read_csv(labels)["frame"].value_counts().tolist() == [count]  # of the other frame nothing
 
 
 def test_neither_a_run_nor_an_image_is_refused(tmp_path: Path) -> None:

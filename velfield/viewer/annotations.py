@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,12 +36,15 @@ class Frames:
         Size of every frame, px.
     read
         Returns the k-th as (h, w) uint8, raw pixels.
+    found
+        Vehicles that a run tracks in them: what a frame without labels begins with.
     """
 
     names: tuple[str, ...]
     width: int
     height: int
     read: Callable[[int], GreyImage]
+    found: tuple[MarkedCar, ...] = ()
 
 
 def frames_to_annotate(path: Path, *, max_frames: int) -> Frames:
@@ -69,9 +72,35 @@ def _frames_of_run(run: Run, max_frames: int) -> Frames:
     chosen = good[np.unique(np.linspace(0, len(good) - 1, min(max_frames, len(good))).round().astype(np.int64))]
     names = _names(run)
     height, width = store.shape
-    return Frames(
-        tuple(names(int(source[frame])) for frame in chosen), width, height, lambda k: store.read(int(chosen[k]))
-    )
+    name = {int(frame): names(int(source[frame])) for frame in chosen}
+    found = tuple(car for car in _tracked_cars(run, name) if _is_inside(car, width, height))
+    return Frames(tuple(name.values()), width, height, lambda k: store.read(int(chosen[k])), found)
+
+
+def _tracked_cars(run: Run, names: Mapping[int, str]) -> Iterator[MarkedCar]:
+    """The vehicles that a run tracks in frames, by their names, and sees there; none before tracks are computed."""
+    if not run.layout.unit_files(run.layout.track_positions):
+        return
+    seen = run.track_positions()
+    seen = seen[seen["frame"].isin(list(names)) & (seen["source"] != "interpolated")]
+    seen = seen.merge(run.detections()[["detection_id", "orientation_rad"]], on="detection_id")
+    sizes = ["length_px", "width_px"]
+    seen = seen.merge(run.vehicles()[["track_id", *sizes]], on="track_id")
+    seen[sizes] = seen[sizes].fillna(seen[sizes].median())
+    for frame, name in names.items():
+        rows = seen[seen["frame"] == frame]
+        axis = rows["orientation_rad"].to_numpy(np.float64)
+        half = np.column_stack([np.cos(axis), np.sin(axis)]) * rows[["length_px"]].to_numpy() / 2
+        middle = rows[["x_px", "y_px"]].to_numpy(np.float64)
+        ends = run.to_raw(frame, np.concatenate([middle - half, middle + half])).reshape(2, -1, 2)
+        ratio = (rows["width_px"] / rows["length_px"]).to_numpy()
+        for (x, y), (dx, dy), wide in zip(ends.mean(axis=0), ends[1] - ends[0], ratio, strict=True):
+            length = math.hypot(dx, dy)
+            if math.isfinite(length * wide):
+                yield MarkedCar(
+                    frame=name, x_px=x, y_px=y, orientation_rad=math.atan2(dy, dx) % math.pi,
+                    length_px=length, width_px=length * wide,
+                )  # fmt: skip
 
 
 def _names(run: Run) -> Callable[[int], str]:
@@ -133,12 +162,15 @@ def _check(marks: Marks, frames: Frames) -> None:
         if name not in frames.names:
             raise InputError(f"found marks of frame {name!r}, expected one of {len(frames.names)} frames shown")
     for car in marks.cars:
-        inside = -0.5 <= car.x_px <= frames.width - 0.5 and -0.5 <= car.y_px <= frames.height - 0.5
-        if not inside or car.frame not in marks.frames:
+        if not _is_inside(car, frames.width, frames.height) or car.frame not in marks.frames:
             raise InputError(
                 f"found a car at ({car.x_px:g}, {car.y_px:g}) of frame {car.frame!r}, expected it within "
                 f"{frames.width}x{frames.height} px and its frame among those sent"
             )
+
+
+def _is_inside(car: MarkedCar, width: int, height: int) -> bool:
+    return -0.5 <= car.x_px <= width - 0.5 and -0.5 <= car.y_px <= height - 0.5
 
 
 def _csv(marks: Marks) -> str:

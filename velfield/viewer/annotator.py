@@ -53,4 +53,5 @@ def _page_content(frames: Frames, labels: Path, token: str) -> dict[str, Any]:
             "frames": [name for name in before.frames if name in shown],
             "cars": [car.model_dump(mode="json") for car in before.cars if car.frame in shown],
         },
+        "found": [car.model_dump(mode="json") for car in frames.found if car.frame not in before.frames],
     }
