@@ -415,7 +415,7 @@ def test_a_short_clip_is_marked_as_of_few_vehicles_a_pixel(page: Page, address: 
     states = run.vehicles()["state"].value_counts()
     assert facts["vehicles that move or wait in a lane"] == str(states["moving"] + states["stopped"])
     assert facts["more that stand throughout: see the notes"] == str(states["parked"])
-    assert ("only looks tell" in page.value("document.querySelector('.notes').textContent")) == (states["parked"] > 0)
+    assert ("Only looks tell" in page.value("document.querySelector('.notes').textContent")) == (states["parked"] > 0)
     assert facts["of the map, passed by vehicles"] == coverage.percent(known, count.size)
     assert facts["of these pixels, by 5 vehicles or more"] == coverage.percent(well, known)
 

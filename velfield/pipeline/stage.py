@@ -337,8 +337,8 @@ STAGES: tuple[Stage, ...] = (
         label="maps",
         lines=(
             Line(
-                "{maps:map}; of the tracks {moving:.0f} move, {stopped:.0f} wait in a lane, {parked:.0f} stand "
-                "throughout (vehicles by their looks alone)"
+                "{maps:map}; tracks that move: {moving:.0f}, that wait in a lane: {stopped:.0f}, that stand throughout "
+                "(vehicles by their looks alone): {parked:.0f}"
             ),
         ),
         unit=f"{_STAGES}.maps:make_maps",

@@ -13,7 +13,6 @@ from schemas.summary import RunSummary, StageSummary
 from velfield.analysis.coverage import low_coverage_note, percent
 from velfield.analysis.vehicles import SURE_SCORE
 from velfield.detection.registry import load_detector
-from velfield.errors import count_text
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import STAGES
 from velfield.report.report import render_report
@@ -147,14 +146,14 @@ def _parked_notes(plan: Plan, states: dict[str, float]) -> list[str]:
     if not states.get("parked"):
         return []
     note = (
-        f"{count_text(states['parked'], 'track')} of what stands throughout: only looks tell that these are vehicles, "
-        "and things on roofs, sheds and trees are among them."
+        f"Tracks of what stands throughout: {states['parked']:.0f}. Only looks tell that these are vehicles; things on "
+        "roofs, sheds and trees are among them."
     )
     if read_working(plan.layout).training_source == "shipped":
         note += (
-            f" {states['parked_sure']:.0f} have a mean score of {SURE_SCORE:g} or more: in the two flights where it "
+            f" With a mean score of {SURE_SCORE:g} or more: {states['parked_sure']:.0f}. In the two flights where it "
             "was checked, a town and a simulated city, 0.83 and 1.0 of such were vehicles, and 0.38 and 0.29 of the "
-            "others. Of this flight it is not known."
+            "others; of this flight it is not known."
         )
     return [note]
 
