@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from schemas.arrays import FloatArray
 from tests.analysis.noisy_tracks import Noise, add_noise, driven
 from velfield.tracking.smoothing import (
     ACCELERATION_NOISE,
@@ -13,6 +14,12 @@ from velfield.tracking.smoothing import (
 )
 
 
+def covariance(errors: PositionErrors, time_s: FloatArray) -> FloatArray:
+    """(n, n) of the errors at the times (n,)."""
+    lag_s = np.abs(time_s[:, None] - time_s)
+    return np.asarray(errors.white_m**2 * (lag_s == 0) + errors.lasting_covariance(lag_s))
+
+
 def test_it_is_the_least_squares_of_the_whole_track() -> None:
     rng = np.random.default_rng(5)
     time_s = np.cumsum(rng.choice([0.2, 0.3, 0.4], 40))
@@ -21,7 +28,7 @@ def test_it_is_the_least_squares_of_the_whole_track() -> None:
     found = smooth_paths(np.array([0, 25, 40]), time_s, seen, errors).xy_m
     for rows in (slice(0, 25), slice(25, 40)):
         t = time_s[rows]
-        n, precision = len(t), np.linalg.inv(errors.covariance(t))
+        n, precision = len(t), np.linalg.inv(covariance(errors, t))
         bend = np.zeros((n - 2, n))
         for i in range(1, n - 1):
             before, after = t[i] - t[i - 1], t[i + 1] - t[i]
@@ -53,7 +60,7 @@ def test_a_vehicle_that_stands_is_at_one_place() -> None:
     rng = np.random.default_rng(0)
     errors = PositionErrors(0.05, 0.3, 1.0)
     seen = true + rng.normal(size=(2, len(time_s))).T @ np.diag([0.05, 0.05])
-    seen += np.linalg.cholesky(errors.covariance(time_s)) @ rng.normal(size=true.shape)
+    seen += np.linalg.cholesky(covariance(errors, time_s)) @ rng.normal(size=true.shape)
     found = smooth_paths(np.array([0, len(time_s)]), time_s, seen, errors).xy_m
     waits = (time_s > 16) & (time_s < 26)
     assert np.ptp(seen[waits], axis=0).min() > 0.5

@@ -53,10 +53,9 @@ class PositionErrors:
         """Standard deviation of a position."""
         return float(np.hypot(self.white_m, self.lasting_m))
 
-    def covariance(self, time_s: FloatArray) -> FloatArray:
-        """(n, n) of the errors at the times (n,)."""
-        lag = np.abs(time_s[:, None] - time_s)
-        return np.asarray(self.white_m**2 * (lag == 0) + self.lasting_m**2 * np.exp(-lag / self.lasts_s))
+    def lasting_covariance(self, lag_s: FloatArray) -> FloatArray:
+        """Covariances of the noise that lasts, m^2, between positions that lie these times >= 0 apart."""
+        return np.asarray(self.lasting_m**2 * np.exp(-lag_s / self.lasts_s))
 
     @property
     def text(self) -> str:
@@ -186,23 +185,24 @@ def _measure(first: IntArray, time_s: FloatArray, xy_m: FloatArray, window_s: fl
         (across[drives], 3),  # nor is a bend
     ]
     spectra = []
-    times = np.asarray(step_s * np.arange(n), np.float64)
+    lag_s = np.asarray(step_s * np.arange(n), np.float64)
     for values, degree in groups:
         if len(values) < _MIN_WINDOWS:
             continue
         basis = _contrasts(n, degree)
-        spectra.append((basis, np.median((values @ basis) ** 2, axis=0) / _CHI2_MEDIAN, len(values)))
+        power = np.median((values @ basis) ** 2, axis=0) / _CHI2_MEDIAN
+        weight = np.full(len(power), min(len(values), 200) / len(power))
+        spectra.append((_lag_weights(basis), power, weight))
     if not spectra:
         return None
+    by_lag, power, weight = (np.concatenate(parts) for parts in zip(*spectra, strict=True))
+    measured = np.log(power + _LEAST_M**2)
 
     def misfit(parameters: FloatArray) -> float:
         errors = _errors(parameters)
-        covariance = errors.covariance(times) + _LEAST_M**2 * np.eye(n)
-        total = 0.0
-        for basis, power, count in spectra:
-            expected = np.einsum("ik,ij,jk->k", basis, covariance, basis)
-            total += min(count, 200) * float(np.mean((np.log(power + _LEAST_M**2) - np.log(expected)) ** 2))
-        return total
+        # White noise gives all contrasts the same power: they are orthonormal.
+        expected = by_lag @ errors.lasting_covariance(lag_s) + (errors.white_m**2 + _LEAST_M**2)
+        return float(weight @ (measured - np.log(expected)) ** 2)
 
     start = np.sqrt(max(float(np.median(spectra[0][1][-n // 3 :])), _LEAST_M**2))
     found = [
@@ -213,9 +213,16 @@ def _measure(first: IntArray, time_s: FloatArray, xy_m: FloatArray, window_s: fl
     return _errors(min(found, key=lambda result: float(result.fun)).x)
 
 
+def _lag_weights(basis: FloatArray) -> FloatArray:
+    """(k, n) weights that take the covariances at lags of 0 to n - 1 points to the powers of contrasts (n, k)."""
+    n = len(basis)
+    products = np.stack([np.sum(basis[lag:] * basis[: n - lag], axis=0) for lag in range(n)], axis=1)
+    return np.asarray(products * np.where(np.arange(n) == 0, 1, 2))
+
+
 def _errors(parameters: FloatArray) -> PositionErrors:
-    white, lasting, lasts = np.exp(np.clip(parameters, -12.0, 5.0))
-    return PositionErrors(float(white), float(lasting), float(np.clip(lasts, *_LASTING_S)))
+    white, lasting, lasts = np.exp(np.minimum(np.maximum(parameters, -12.0), 5.0)).tolist()
+    return PositionErrors(white, lasting, min(max(lasts, _LASTING_S[0]), _LASTING_S[1]))
 
 
 def _windows(first: IntArray, time_s: FloatArray, window_s: float) -> tuple[IntArray, float]:
