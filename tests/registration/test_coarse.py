@@ -13,6 +13,7 @@ from velfield.registration.intersensor.coarse import (
     estimate_sift_homography,
     scaling_matrix,
     search_similarity,
+    sift_keypoints,
     sift_scale,
     similarity_matrix,
 )
@@ -77,7 +78,7 @@ def test_a_similarity_maps_its_point_and_keeps_angles(scale: float, angle: float
 def test_sift_finds_the_homography_of_any_rotation(ground: np.ndarray, scale: float, rotation_deg: float) -> None:
     to_base = view(scale, rotation_deg)
     image = photograph(ground, to_base, LENS, SHAPE, 1)
-    found = estimate_sift_homography(image, ground, LENS, scale=0.25)
+    found = estimate_sift_homography(image, sift_keypoints(ground, 0.25), LENS, scale=0.25)
     assert found.matrix is not None
     assert MIN_INLIERS <= found.inliers <= found.matches
     error = by_homography(found.matrix, corners()) - by_homography(to_base, corners())
@@ -86,16 +87,17 @@ def test_sift_finds_the_homography_of_any_rotation(ground: np.ndarray, scale: fl
 
 def test_a_flipped_image_matches_when_mirrored_alone(ground: np.ndarray) -> None:
     flipped = np.ascontiguousarray(photograph(ground, view(1.0, 10.0), pinhole(SHAPE), SHAPE, 1)[:, ::-1])
-    lens = pinhole(SHAPE)
-    assert estimate_sift_homography(flipped, ground, lens, scale=0.25).matrix is None
-    assert estimate_sift_homography(flipped, ground, lens, scale=0.25, mirrored=True).matrix is not None
+    lens, of_ground = pinhole(SHAPE), sift_keypoints(ground, 0.25)
+    assert estimate_sift_homography(flipped, of_ground, lens, scale=0.25).matrix is None
+    assert estimate_sift_homography(flipped, of_ground, lens, scale=0.25, mirrored=True).matrix is not None
 
 
 def test_too_few_features_or_matches_give_no_matrix_but_their_numbers(ground: np.ndarray) -> None:
     image = photograph(ground, view(1.0, 0.0), pinhole(SHAPE), SHAPE, 1)
-    flat = estimate_sift_homography(np.full(SHAPE, 90, np.uint8), ground, pinhole(SHAPE), scale=0.25)
+    of_ground, of_other = (sift_keypoints(base, 0.25) for base in (ground, city(77, 600, blocks=200)))
+    flat = estimate_sift_homography(np.full(SHAPE, 90, np.uint8), of_ground, pinhole(SHAPE), scale=0.25)
     assert (flat.matrix, flat.matches, flat.inliers) == (None, 0, 0)
-    other = estimate_sift_homography(image, city(77, 600, blocks=200), pinhole(SHAPE), scale=0.25)
+    other = estimate_sift_homography(image, of_other, pinhole(SHAPE), scale=0.25)
     assert other.matrix is None
     assert other.inliers < MIN_INLIERS
 

@@ -15,7 +15,7 @@ from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.registration.intersensor.modality import MODALITIES, Modality, Transform
-from velfield.registration.keypoints import detect_keypoints, is_plausible, match_descriptors
+from velfield.registration.keypoints import Keypoints, detect_keypoints, is_plausible, match_descriptors
 from velfield.registration.transforms import HomographyTransform, frame_corners
 
 MIN_INLIERS = 10
@@ -75,28 +75,33 @@ def sift_scale(shape: tuple[int, ...], scale: float) -> float:
     return float(min(1.0, max(scale, _MIN_SIFT_SIDE_PX / max(shape))))
 
 
+def sift_keypoints(grey: GreyImage, scale: float) -> Keypoints:
+    """SIFT keypoints of an image (h, w) uint8, detected at a scale; small images are kept larger."""
+    config = RegistrationConfig(keypoint_scale=sift_scale(grey.shape, scale))
+    return detect_keypoints(grey, config, count=_SIFT_FEATURES)
+
+
 def estimate_sift_homography(
-    image: GreyImage, base: GreyImage, lens: Lens, *, scale: float, mirrored: bool = False
+    image: GreyImage, of_base: Keypoints, lens: Lens, *, scale: float, mirrored: bool = False
 ) -> SiftHomography:
     """Homography of the SIFT matches between a frame and the base image, by MAGSAC.
 
     Parameters
     ----------
-    image, base
+    image
         (h, w) uint8.
+    of_base
+        Keypoints of the base image.
     lens
         Undistorts the frame's keypoints; the homography maps undistorted px to base px.
     scale
-        Scale at which features are detected; small images are kept larger.
+        Scale at which the frame's keypoints are detected.
     mirrored
         Flip the frame left to right first: to recognise a flipped base image, never to register to it.
     """
     if mirrored:
         image = np.ascontiguousarray(image[:, ::-1])
-    of_image, of_base = (
-        detect_keypoints(grey, RegistrationConfig(keypoint_scale=sift_scale(grey.shape, scale)), count=_SIFT_FEATURES)
-        for grey in (image, base)
-    )
+    of_image = sift_keypoints(image, scale)
     pairs = match_descriptors(_root(of_image.descriptors), _root(of_base.descriptors))
     source, target = lens.undistort_points(of_image.xy[pairs[:, 0]]), of_base.xy[pairs[:, 1]]
     finite = np.isfinite(source).all(axis=1)

@@ -8,6 +8,7 @@ the robust scale of the residuals until the set is stable.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -17,9 +18,10 @@ from schemas.flight import BaseConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
 from velfield.registration.fitting import Model, fit_by_case_deletion, fit_polyprojective
-from velfield.registration.intersensor.coarse import CoarseCandidate, downscale
+from velfield.registration.intersensor.coarse import CoarseCandidate, downscale, sift_keypoints
 from velfield.registration.intersensor.correlation import GridMatches, match_grid
 from velfield.registration.intersensor.modality import GRADIENT, Modality
+from velfield.registration.keypoints import Keypoints
 from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,
@@ -45,6 +47,11 @@ class ImagePair:
     base: GreyImage
     lens: Lens
     config: BaseConfig
+
+    @cached_property
+    def base_keypoints(self) -> Keypoints:
+        """Keypoints of the base image, to which the frame's are matched in each modality, and mirrored."""
+        return sift_keypoints(self.base, self.config.coarse_scale)
 
     def transform(self, polyprojective: PolyprojectiveTransform) -> FrameTransform:
         """The frame's map, raw px to base px: the lens, then a transform of undistorted px."""

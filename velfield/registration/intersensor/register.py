@@ -21,6 +21,7 @@ from velfield.registration.fitting import Model
 from velfield.registration.intersensor.coarse import (
     MIN_INLIERS,
     CoarseCandidate,
+    SiftHomography,
     estimate_sift_homography,
     search_similarity,
 )
@@ -144,22 +145,22 @@ def register_intersensor(
         if count >= config.min_control_points and verification.is_verified:
             if candidate.is_blind and not verification.is_certain:
                 continue  # a town of equal blocks matches another place of its own kind, with up to 0.43 of the patches
-            if not verification.is_certain and _matches_flipped(pair):
+            if not verification.is_certain and _match_flipped(pair).matrix is not None:
                 break  # straight roads match their own mirror image well enough to pass the verification
             return _to_result(pair, fit, candidate, tuple(scores))
     return Failure(_explain_failure(pair, scores))
 
 
-def _matches_flipped(pair: ImagePair) -> bool:
-    """Whether the flipped frame matches the base image by SIFT."""
-    flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
-    return flipped.matrix is not None
+def _match_flipped(pair: ImagePair) -> SiftHomography:
+    """SIFT matches of the flipped frame to the base image."""
+    scale = pair.config.coarse_scale
+    return estimate_sift_homography(pair.image, pair.base_keypoints, pair.lens, scale=scale, mirrored=True)
 
 
 def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
     """Message with the cause of a failed registration, and what to do."""
     _LOG.debug("no candidate is verified: %s", "; ".join(scores))
-    flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
+    flipped = _match_flipped(pair)
     if flipped.matrix is not None:
         return f"{MIRRORED} ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
     return (
@@ -176,7 +177,7 @@ def _coarse_candidates(pair: ImagePair, initial: FloatArray | None, scores: list
         if modality.sift_transform is None:
             continue
         image, method = modality.sift_transform(pair.image), f"SIFT ({modality.name})"
-        sift = estimate_sift_homography(image, pair.base, pair.lens, scale=pair.config.coarse_scale)
+        sift = estimate_sift_homography(image, pair.base_keypoints, pair.lens, scale=pair.config.coarse_scale)
         if sift.matrix is None:
             scores.append(f"{method}: {sift.inliers} inliers of {sift.matches} matches, {MIN_INLIERS} needed")
             continue
