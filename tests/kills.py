@@ -1,4 +1,4 @@
-"""SIGKILL at random moments: `make soak` runs this fifty times, the tests three.
+"""SIGKILL at random moments: `make soak` runs this fifty times, the tests two: one of them SIGTERM.
 
 python -m tests.kills [--kills 50]
 """

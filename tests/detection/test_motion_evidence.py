@@ -11,18 +11,22 @@ import pytest
 from schemas.job import Inputs, Job
 from schemas.tables import DETECTION_COLUMNS
 from tests.benchmarks import marked_frame, real_footage
-from tests.small_flight import process
 from tools.training_data import read_boxes
 from velfield import open_run
 from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import make_plan, write_flight_record
+from velfield.pipeline.stage import stages_before
 from velfield.run.run import Run
 from velfield.run.tables import read_tables
 
 
 def _run(source: Path, root: Path, *settings: str) -> Run:
-    """A run given the video and nothing else but what makes the test short."""
+    """A run up to its tracks, given the video and nothing else but what makes the test short."""
     config = resolve_config(settings=["lens.calibrate=never", *settings], overrides={})
-    assert process(Job(root=str(root), inputs=Inputs(source=str(source)), config=config)).complete
+    plan = make_plan(Job(root=str(root), inputs=Inputs(source=str(source)), config=config))
+    write_flight_record(plan)
+    compute_stages(plan, stages_before("scale"))
     return open_run(root)
 
 

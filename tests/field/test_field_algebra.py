@@ -23,6 +23,9 @@ from velfield.run.field_reader import known_tiles
 from velfield.run.run import open_run
 from velfield.run.stores import open_field
 
+COARSE = FieldConfig(bin_width_m_per_s=3.0)
+"""Half of the usual bins, in less of the time; still coarser ones shift the percentiles that changes are found by."""
+
 
 def everything(root: Path) -> dict[str, np.ndarray]:
     """The histogram and all layers."""
@@ -50,7 +53,7 @@ def shape() -> tuple[int, int]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory, table: pd.DataFrame, shape: tuple[int, int]) -> Path:
-    return field_run(tmp_path_factory.mktemp("whole") / "run", table, shape=shape).layout.root
+    return field_run(tmp_path_factory.mktemp("whole") / "run", table, shape=shape, config=COARSE).layout.root
 
 
 def test_four_disjoint_sets_added_equal_the_field_of_all_to_the_bit(
@@ -60,7 +63,7 @@ def test_four_disjoint_sets_added_equal_the_field_of_all_to_the_bit(
     tracks = np.unique(table["track_id"])
     for k in range(4):
         mine = table[table["track_id"].isin(tracks[k::4])]
-        parts.append(field_run(tmp_path / f"part{k}", mine, shape=shape).layout.root)
+        parts.append(field_run(tmp_path / f"part{k}", mine, shape=shape, config=COARSE).layout.root)
     merge_fields(parts, tmp_path / "sum")
     found = everything(tmp_path / "sum")
     assert found["count"].max() >= 3
@@ -76,9 +79,9 @@ def test_four_disjoint_sets_added_equal_the_field_of_all_to_the_bit(
 def test_fields_on_different_grids_are_refused_in_one_line(
     tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
 ) -> None:
-    smaller = field_run(tmp_path / "smaller", table, shape=(shape[0] - 8, shape[1])).layout.root
-    coarser = field_run(tmp_path / "coarser", table, shape=shape, config=FieldConfig(bin_width_m_per_s=4.0)).layout.root
-    for other, what in ((smaller, "size"), (coarser, "bin_width")):
+    smaller = field_run(tmp_path / "smaller", table, shape=(shape[0] - 8, shape[1]), config=COARSE).layout.root
+    finer = field_run(tmp_path / "finer", table, shape=shape).layout.root
+    for other, what in ((smaller, "size"), (finer, "bin_width")):
         for attempt in (
             lambda other=other: merge_fields([whole, other], tmp_path / "out"),
             lambda other=other: subtract_fields(whole, other, tmp_path / "out"),
@@ -108,12 +111,12 @@ def test_comparison_finds_a_change_and_none_in_a_random_split(
     """Half of the tracks against the other half: no change. All at 40 % of their speed: a change of that size."""
     tracks = np.random.default_rng(0).permutation(np.unique(table["track_id"]))
     halves = [
-        field_run(tmp_path / name, table[table["track_id"].isin(tracks[k::2])], shape=shape).layout.root
+        field_run(tmp_path / name, table[table["track_id"].isin(tracks[k::2])], shape=shape, config=COARSE).layout.root
         for k, name in enumerate(("even", "odd"))
     ]
     lines = compare_runs(*halves, tmp_path / "chance", min_count=2)
     assert sum("no significant change" in line for line in lines[:3]) >= 2, lines
-    slow = field_run(tmp_path / "slow", slowed(table, 0.4), shape=shape).layout.root
+    slow = field_run(tmp_path / "slow", slowed(table, 0.4), shape=shape, config=COARSE).layout.root
     assert "before_after.html" in lines[-1]
     lines = compare_runs(whole, slow, tmp_path / "change", min_count=2)
     assert "no significant" not in lines[1]
@@ -168,7 +171,8 @@ def test_significance_is_benjamini_and_hochbergs_step_up_rule(seed: int, n: int,
 def test_slices_of_time_add_up_to_the_whole(
     tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path, text: str
 ) -> None:
-    run = field_run(tmp_path / "run", table, shape=shape, config=FieldConfig(time_intervals=text))
+    config = COARSE.model_copy(update={"time_intervals": text})
+    run = field_run(tmp_path / "run", table, shape=shape, config=config)
     assert_equal(everything(run.layout.root), everything(whole))
     intervals = run.field_intervals
     assert list(intervals) == {"4s": ["0-4", "4-8", "8-12"], "2-5,7-9": ["2-5", "7-9", "rest"]}[text]

@@ -112,7 +112,7 @@ def test_the_example_finds_fewer_wrong_links_at_no_lower_recall() -> None:
     assert spec.loader is not None
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    plain, helped = example.measure(5, frames=400, size=(320, 240))
+    plain, helped = example.measure(5, frames=300, size=(240, 180))
     assert plain.wrong >= 20
     assert helped.wrong < 0.7 * plain.wrong
     assert helped.recall >= plain.recall

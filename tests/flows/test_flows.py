@@ -16,11 +16,13 @@ from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
 from velfield.errors import InputError
-from velfield.pipeline.plan import make_plan
-from velfield.pipeline.stage import STAGE, STAGES
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import make_plan, write_flight_record
+from velfield.pipeline.stage import STAGE, STAGES, stages_before
 from velfield.pipeline.stages.report import make_report
 from velfield.pipeline.summary import summarise_run
 from velfield.report.report import render_report
+from velfield.run.commits import read_commit
 from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
 
@@ -137,11 +139,16 @@ def following_names(first: str) -> list[str]:
 def test_workers_give_the_same_bits(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Workers of a long flight, which are restarted on the way; previews have a test of their own."""
+    """Workers of a long flight, which are restarted on the way; previews have a test of their own.
+
+    The first time they are: each start takes 5 s of processor, and tests of clusters show what a restart does.
+    """
     monkeypatch.setattr("velfield.pipeline.plan.LONG_MPX", 0.0)
     monkeypatch.setattr("flows.process_flight.Previews", lambda *_: None)
     restarted, true = [], ClientRunner.restart_workers
-    monkeypatch.setattr(ClientRunner, "restart_workers", lambda self: restarted.append(true(self)))
+    monkeypatch.setattr(
+        ClientRunner, "restart_workers", lambda self: restarted.append(None if restarted else true(self))
+    )
     process(job(flight, tmp_path / "workers"), RunnerConfig(workers=2))
     assert len(restarted) == sum(stage.new_workers for stage in STAGES) > 0
     assert digests(tmp_path / "workers") == digests(whole[0])
@@ -314,13 +321,14 @@ def test_the_size_of_given_boxes_sets_the_working_scale(flight: Path, tmp_path: 
     scales, warned = [], []
     for boxes in (sized, bare):
         unsized = job(flight, tmp_path / boxes.stem, "frames.stop_s=1.0", detections=str(boxes))
-        unsized = unsized.model_copy(update={"config": unsized.config.model_copy(update={"gsd_m": None})})
-        summary = process(unsized)
+        plan = make_plan(unsized.model_copy(update={"config": unsized.config.model_copy(update={"gsd_m": None})}))
+        write_flight_record(plan)
+        compute_stages(plan, stages_before("detections"))
         record = json.loads((tmp_path / boxes.stem / "base" / "working.json").read_text())
         scales.append(record["scale"])
-        warned.append(
-            [line for stage in summary.stages if stage.name == "detector" for line in stage.warnings if "size" in line]
-        )
+        commit = read_commit(plan.layout, "detector", "all")
+        assert commit is not None
+        warned.append([line for line in commit.warnings if "size" in line])
     assert scales[0] == pytest.approx(0.8, rel=0.1)
     assert scales[1] == 1.0
     assert not warned[0]

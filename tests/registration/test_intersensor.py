@@ -134,9 +134,11 @@ def test_a_mirrored_base_image_is_refused_and_called_so(ground: np.ndarray, base
     assert result.reason.endswith("flip it")
 
 
-def test_a_black_frame_is_refused(base: np.ndarray) -> None:
-    result = register_intersensor(np.zeros(SHAPE, dtype=np.uint8), base, CONFIG, lens=LENS)
-    assert isinstance(result, Failure)
+def test_a_black_frame_and_a_base_image_of_noise_are_refused(ground: np.ndarray, base: np.ndarray) -> None:
+    noise = np.random.default_rng(5).integers(0, 256, base.shape).astype(np.uint8)
+    image = photograph(ground, view(1.0, 5.0), LENS, SHAPE, 1)
+    for pair in ((np.zeros(SHAPE, dtype=np.uint8), base), (image, noise)):
+        assert isinstance(register_intersensor(*pair, CONFIG, lens=LENS), Failure)
 
 
 def test_the_grid_stage_measures_a_known_shift_below_the_pixel(ground: np.ndarray) -> None:
