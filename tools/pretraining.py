@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from schemas.arrays import Float32Array
+from tools.hard_patches import HardPatchDataset
 from velfield.detection.cnn.dataset import PATCH_PX, Patch, PatchDataset, highest_gaussians, to_batch
 from velfield.detection.cnn.model import find_peaks
 from velfield.detection.cnn.network import (
@@ -223,7 +224,7 @@ def pretrain(
     on_step
         Called with each step's number, its loss, and the averaged module.
     """
-    patches = PatchDataset(groups, weights, seed, hard=True)
+    patches = HardPatchDataset(groups, weights, seed)
     first = np.concatenate([patches.make_batch(step).images for step in range(4)])
     batches = _load(patches, range(steps))
     module, average = (start_from(start, first).to(memory_format=torch.channels_last) for _ in range(2))
@@ -232,7 +233,7 @@ def pretrain(
     for step in range(steps):
         if tiles and step == tiles_from:
             labelled = label_tiles(average, start, tiles)
-            more = PatchDataset([*groups, labelled], [*weights, tiles_weight], seed, hard=True)
+            more = HardPatchDataset([*groups, labelled], [*weights, tiles_weight], seed)
             batches = _load(more, range(step, steps))
         for group in optimiser.param_groups:
             group["lr"] = LEARNING_RATE * lr_schedule(step / steps)

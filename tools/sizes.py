@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from schemas.arrays import Float32Array, FloatArray
+from tools.hard_patches import HardPatchDataset
 from velfield.detection.cnn.dataset import Patch, PatchDataset
 from velfield.detection.cnn.graph import network_graph
 from velfield.detection.cnn.inference import Predictor
@@ -44,7 +45,7 @@ def fit_sizes(
     steps: int = STEPS,
 ) -> Network:
     """The network with a layer of sizes fitted to it; ``groups`` and ``weights`` as for `PatchDataset`."""
-    dataset = PatchDataset(groups, weights, seed, hard=True, log_scale_range=LOG_SCALE_RANGE)
+    dataset = HardPatchDataset(groups, weights, seed, log_scale_range=LOG_SCALE_RANGE)
     features, logarithms = _read_vehicles(network, dataset, steps)
     weight, bias = _fit(features, logarithms, seed)
     return Network(

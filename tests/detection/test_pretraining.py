@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from tools.hard_patches import HardPatchDataset
 from velfield.bench.scenes import simulated_image
-from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.inference import Predictor
 from velfield.detection.cnn.model import detect_cars
 from velfield.detection.cnn.network import Network
@@ -22,7 +22,7 @@ def shipped() -> Network:
 def test_training_starts_from_the_network_given_and_the_loss_is_that_of_fine_tuning() -> None:
     from tools.pretraining import focal_loss, start_from, to_network
 
-    batch = PatchDataset([[simulated_image(9504)]], [1.0], 0, hard=True)(0)
+    batch = HardPatchDataset([[simulated_image(9504)]], [1.0], 0)(0)
     module = start_from(shipped(), batch.images)
     with torch.no_grad():
         out = module(torch.from_numpy(batch.images)[:, None])
@@ -41,7 +41,7 @@ def test_pretraining_lowers_the_loss_and_learns_sizes() -> None:
     groups, seen = [[simulated_image(9504)]], []
     pretrain(groups, [1.0], start=shipped(), seed=0, steps=60, on_step=lambda _, loss, module: seen.append(loss))
     assert np.mean(seen[-8:]) < 0.9 * np.mean(seen[:8])
-    batch = SizedBatch.of(PatchDataset(groups, [1.0], 0, hard=True).make_patches(0))
+    batch = SizedBatch.of(HardPatchDataset(groups, [1.0], 0).make_patches(0))
     lengths = 16 * np.exp(batch.size[batch.size_weight[..., 0] > 0.5][:, 0])
     assert 10 < lengths.min() < lengths.max() < 70
 

@@ -2,9 +2,7 @@
 
 A patch is cut by a random similarity transform (position, rotation, mirroring, scale) and then augmented
 photometrically (gamma, contrast, brightness, blur, a shadow's edge, noise), to resemble images of other sensors and in
-other light. For pre-training there are also inverted polarity (as heat has), haze, the losses of compressed video, cars
-in the tone of the road, and cars that the image's edge cuts. Targets are a heatmap with a Gaussian at each vehicle's
-centre, and the orientation at each of its pixels.
+other light. Targets are a heatmap with a Gaussian at each vehicle's centre, and the orientation at each of its pixels.
 """
 
 from collections.abc import Sequence
@@ -46,20 +44,6 @@ _HEATMAP_REACH = 10
 _HEATMAP_PX = np.arange(PATCH_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
 """Positions of the heatmap's rows and columns in the patch, px."""
 
-_CAMOUFLAGE_PROBABILITY, _CAMOUFLAGED_FRACTION = 0.5, 0.5
-"""Fraction of the patches with camouflaged cars, and fraction of the cars in such a patch."""
-_CAMOUFLAGE_CONTRAST, _CAMOUFLAGE_SHIFT = (0.25, 0.9), (-0.08, 0.02)
-_COVER_RATIO, _ROAD_MEDIAN_PX = (1.25, 1.5), 31
-"""Length and width of what is redrawn, over the vehicle's."""
-_EDGE_PROBABILITY = 0.12
-_LARGE_RATIO, _LARGE_WEIGHT = 1.35, 5.0
-"""A vehicle this many times as long as a car is that many times as often the one that a patch is centred near."""
-_INVERSION_PROBABILITY = 0.1
-_HAZE_PROBABILITY, _HAZE_CONTRAST, _HAZE_LEVEL = 0.15, (0.15, 0.5), (0.4, 0.8)
-_VIDEO_PROBABILITY, _VIDEO_QUALITY, _VIDEO_REDUCTION = 0.35, (12, 70), (0.5, 1.0)
-_SHARPENING_PROBABILITY, _SHARPENING, _SHARPENING_SIGMA_PX = 0.2, (0.3, 1.5), (0.6, 1.2)
-"""Drones sharpen their video: halos about cars."""
-
 
 class Patch(NamedTuple):
     """A patch and its targets, in the order of `Batch`; its vehicles (n, 5): x, y, axis, length and width, px of it."""
@@ -83,8 +67,6 @@ class PatchDataset:
         Sampling weight of each group, whatever its number of images.
     seed
         Seed of all random numbers.
-    hard
-        Bring cars near to the tone of the road about them, and cut patches as the image's edge does: for pre-training.
     log_scale_range
         Greatest logarithm of the factor by which a patch is scaled, either way.
     """
@@ -95,10 +77,9 @@ class PatchDataset:
         weights: Sequence[float],
         seed: int,
         *,
-        hard: bool = False,
         log_scale_range: float = _LOG_SCALE_RANGE,
     ) -> None:
-        self._hard, self._log_scale_range = hard, log_scale_range
+        self._log_scale_range = log_scale_range
         self._groups = [[_with_orientations(sample) for sample in group] for group in groups]
         self._probabilities = np.array(weights, float) / np.sum(weights)
         self._seed = seed
@@ -122,8 +103,53 @@ class PatchDataset:
         for _ in range(BATCH_SIZE):
             group = self._groups[rng.choice(len(self._groups), p=self._probabilities)]
             sample = group[rng.integers(len(group))]
-            patches.append(_sample_patch(sample, rng, hard=self._hard, log_scale_range=self._log_scale_range))
+            patches.append(self._sample_patch(sample, rng))
         return patches
+
+    def choose_car(self, cars: FloatArray, rng: np.random.Generator) -> int:
+        """Which of the cars (n, 5) of an image a patch is centred near."""
+        return int(rng.integers(len(cars)))
+
+    def redraw(self, patch: Float32Array, vehicles: FloatArray, rng: np.random.Generator) -> Float32Array:
+        """A patch with vehicles (n, 5), px of it, before it is exposed; as it is."""
+        return patch
+
+    def target_lengths_px(self, vehicles: FloatArray) -> FloatArray | None:
+        """Lengths (n,) by which Gaussians grow; none: those of usual cars."""
+        return None
+
+    def augment_photometry(self, patch: Float32Array, mask: Mask, rng: np.random.Generator) -> Float32Array:
+        """The patch as another sensor would see it; ``mask`` (m, m), changed in place, is where its targets count."""
+        return add_noise(expose(patch, rng), rng)
+
+    def _sample_patch(self, sample: LabelledImage, rng: np.random.Generator) -> Patch:
+        if len(sample.cars) and rng.random() < _CENTRED_FRACTION:
+            centre = sample.cars[self.choose_car(sample.cars, rng), :2] + rng.normal(0, _CENTRING_SD_PX, 2)
+        else:
+            centre = rng.uniform(0, sample.image.shape[::-1])
+        matrix = _random_similarity(centre, rng, self._log_scale_range)
+        rows, columns, window_matrix = _source_window(matrix, sample.image.shape)
+        image = sample.image[rows, columns].astype(np.float32)
+        patch = cv2.warpAffine(image, window_matrix, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
+        patch *= np.float32(1 / 255)
+        vehicles, scale = sample.cars[:, :5].copy(), float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+        vehicles[:, :2] = vehicles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
+        direction = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
+        vehicles[:, 2] = np.arctan2(direction[:, 1], direction[:, 0])
+        vehicles[:, 3:] *= scale
+        patch = self.redraw(patch, vehicles, rng)
+        heatmap, orientation, weight = encode_targets(vehicles[:, :2], vehicles[:, 2], self.target_lengths_px(vehicles))
+        valid = np.ones(image.shape, np.uint8) if sample.valid is None else sample.valid[rows, columns].astype(np.uint8)
+        on_heatmap = window_matrix / STRIDE  # every second pixel of the patch
+        mask = cv2.warpAffine(valid, on_heatmap, (len(_HEATMAP_PX), len(_HEATMAP_PX)), flags=cv2.INTER_NEAREST) > 0
+        circles = np.column_stack([sample.ignore[:, :2] @ matrix[:, :2].T + matrix[:, 2], scale * sample.ignore[:, 2]])
+        reach = circles[:, 2:] + STRIDE
+        nearby = ((circles[:, :2] > -reach) & (circles[:, :2] < PATCH_PX + reach)).all(axis=1)
+        for x, y, radius in circles[nearby]:
+            ignored = np.hypot(_HEATMAP_PX[None, :] - x, _HEATMAP_PX[:, None] - y) < radius + STRIDE
+            mask &= ~ignored | (heatmap > 0.1)
+        patch = self.augment_photometry(patch, mask, rng)
+        return Patch(patch, heatmap, mask.astype(np.float32), orientation, weight * mask, vehicles)
 
 
 def to_batch(patches: Sequence[Patch]) -> Batch:
@@ -135,81 +161,8 @@ def _with_orientations(sample: LabelledImage) -> LabelledImage:
     return replace(sample, cars=fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad))
 
 
-def _sample_patch(sample: LabelledImage, rng: np.random.Generator, *, hard: bool, log_scale_range: float) -> Patch:
-    matrix = _random_similarity(sample, rng, log_scale_range, large_weight=_LARGE_WEIGHT if hard else 1.0)
-    rows, columns, window_matrix = _source_window(matrix, sample.image.shape)
-    image = sample.image[rows, columns].astype(np.float32)
-    patch = cv2.warpAffine(image, window_matrix, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
-    patch *= np.float32(1 / 255)
-    vehicles, scale = sample.cars[:, :5].copy(), float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
-    vehicles[:, :2] = vehicles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
-    direction = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
-    vehicles[:, 2] = np.arctan2(direction[:, 1], direction[:, 0])
-    vehicles[:, 3:] *= scale
-    if hard:
-        patch = _camouflage_cars(patch, vehicles, rng)
-    heatmap, orientation, weight = encode_targets(vehicles[:, :2], vehicles[:, 2], vehicles[:, 3] if hard else None)
-    valid = np.ones(image.shape, np.uint8) if sample.valid is None else sample.valid[rows, columns].astype(np.uint8)
-    on_heatmap = window_matrix / STRIDE  # every second pixel of the patch
-    mask = cv2.warpAffine(valid, on_heatmap, (len(_HEATMAP_PX), len(_HEATMAP_PX)), flags=cv2.INTER_NEAREST) > 0
-    circles = np.column_stack([sample.ignore[:, :2] @ matrix[:, :2].T + matrix[:, 2], scale * sample.ignore[:, 2]])
-    reach = circles[:, 2:] + STRIDE
-    nearby = ((circles[:, :2] > -reach) & (circles[:, :2] < PATCH_PX + reach)).all(axis=1)
-    for x, y, radius in circles[nearby]:
-        ignored = np.hypot(_HEATMAP_PX[None, :] - x, _HEATMAP_PX[:, None] - y) < radius + STRIDE
-        mask &= ~ignored | (heatmap > 0.1)
-    if hard and rng.random() < _EDGE_PROBABILITY:
-        patch = _cut_by_edge(patch, mask, rng)
-    patch = _augment_photometry(patch, rng, hard=hard)
-    return Patch(patch, heatmap, mask.astype(np.float32), orientation, weight * mask, vehicles)
-
-
-def _camouflage_cars(patch: Float32Array, vehicles: FloatArray, rng: np.random.Generator) -> Float32Array:
-    """Draw some cars in a tone nearer to that of the road about them, and darker: what a detector misses most."""
-    near = _near_patch(vehicles)
-    if not len(near) or rng.random() > _CAMOUFLAGE_PROBABILITY:
-        return patch
-    road = cv2.medianBlur((np.clip(patch, 0, 1) * 255).astype(np.uint8), _ROAD_MEDIAN_PX).astype(np.float32) / 255
-    y, x = np.mgrid[:PATCH_PX, :PATCH_PX].astype(np.float32)
-    for cx, cy, angle, length, width in with_usual_size(vehicles[near]):
-        if rng.random() > _CAMOUFLAGED_FRACTION:
-            continue
-        half_length, half_width = _COVER_RATIO[0] * length / 2, _COVER_RATIO[1] * width / 2
-        along = np.abs(np.cos(angle) * (x - cx) + np.sin(angle) * (y - cy)) / half_length
-        across = np.abs(-np.sin(angle) * (x - cx) + np.cos(angle) * (y - cy)) / half_width
-        cover = np.clip(3 - 2 * np.maximum(along, across), 0, 1).astype(np.float32)
-        contrast, darker = rng.uniform(*_CAMOUFLAGE_CONTRAST), rng.uniform(*_CAMOUFLAGE_SHIFT)
-        patch = patch * (1 - cover) + cover * (road + contrast * (patch - road) + darker)
-    return np.asarray(patch, np.float32)
-
-
-def _cut_by_edge(patch: Float32Array, mask: Mask, rng: np.random.Generator) -> Float32Array:
-    """Continue a patch beyond a vertical line by its mirror image, as inference pads a frame; what is beyond it is not
-    counted."""
-    edge = int(rng.integers(20, PATCH_PX - 20))
-    if edge > PATCH_PX // 2:
-        mask[:, (edge + 1) // STRIDE :] = False
-        cut = cv2.copyMakeBorder(patch[:, :edge], 0, 0, 0, PATCH_PX - edge, cv2.BORDER_REFLECT_101)
-    else:
-        mask[:, : edge // STRIDE] = False
-        cut = cv2.copyMakeBorder(patch[:, edge:], 0, 0, edge, 0, cv2.BORDER_REFLECT_101)
-    return np.asarray(cut, np.float32)
-
-
-def _random_similarity(
-    sample: LabelledImage, rng: np.random.Generator, log_scale_range: float, *, large_weight: float = 1.0
-) -> FloatArray:
-    """Affine matrix (2, 3) from image to patch: centred near a car or anywhere, rotated, mirrored, scaled."""
-    height, width = sample.image.shape
-    if len(sample.cars) and rng.random() < _CENTRED_FRACTION:
-        if large_weight == 1.0:
-            chosen = int(rng.integers(len(sample.cars)))
-        else:
-            chance = np.where(sample.cars[:, 3] > _LARGE_RATIO * USUAL_SIZE_PX[0], large_weight, 1.0)
-            chosen = int(np.searchsorted(np.cumsum(chance), rng.random() * chance.sum(), side="right"))
-        centre = sample.cars[chosen, :2] + rng.normal(0, _CENTRING_SD_PX, 2)
-    else:
-        centre = rng.uniform(0, (width, height))
+def _random_similarity(centre: FloatArray, rng: np.random.Generator, log_scale_range: float) -> FloatArray:
+    """Affine matrix (2, 3) from image to patch: centred on a position, rotated, mirrored, scaled."""
     angle, scale = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(-log_scale_range, log_scale_range))
     c, s = scale * np.cos(angle), scale * np.sin(angle)
     linear = np.array([[c, -s], [s, c]]) * (rng.choice([-1.0, 1.0]), 1.0)
@@ -232,7 +185,7 @@ def _source_window(matrix: FloatArray, shape: tuple[int, ...]) -> tuple[slice, s
     return slice(first[1], last[1] + 1), slice(first[0], last[0] + 1), shifted
 
 
-def _near_patch(vehicles: FloatArray) -> IntArray:
+def near_patch(vehicles: FloatArray) -> IntArray:
     """Rows of vehicles (n, 2...) whose centre is in the patch, or near its border."""
     xy = vehicles[:, :2]
     return np.flatnonzero(((xy > -_TARGET_MARGIN_PX) & (xy < PATCH_PX + _TARGET_MARGIN_PX)).all(axis=1))
@@ -271,7 +224,7 @@ def highest_gaussians(vehicles: FloatArray) -> tuple[Float32Array, IntArray]:
     """Heatmap (m, m) of vehicles (n, 4...) as x, y, axis, length, and whose Gaussian each pixel shows; -1: none's."""
     size = len(_HEATMAP_PX)
     heatmap, number = np.zeros((size, size), np.float32), np.full((size, size), -1)
-    near = _near_patch(vehicles)
+    near = near_patch(vehicles)
     first = np.rint((vehicles[near, :2] - _HEATMAP_PX[0]) / STRIDE).astype(int) - _HEATMAP_REACH
     last = (first + 2 * _HEATMAP_REACH + 1).clip(0).tolist()
     stretch = np.sqrt(np.fmax(vehicles[near, 3] / USUAL_SIZE_PX[0], 1.0))  # of an unknown length: 1
@@ -289,13 +242,8 @@ def highest_gaussians(vehicles: FloatArray) -> tuple[Float32Array, IntArray]:
     return heatmap, number
 
 
-def _augment_photometry(patch: Float32Array, rng: np.random.Generator, *, hard: bool) -> Float32Array:
-    """Photometric augmentation: gamma, contrast, brightness, blur, shadow, noise; grey stays in [0, 1].
-
-    ``hard`` adds inverted polarity, haze and the losses of video.
-    """
-    if hard and rng.random() < _INVERSION_PROBABILITY:
-        patch = 1 - patch
+def expose(patch: Float32Array, rng: np.random.Generator) -> Float32Array:
+    """A patch, grey in [0, 1], under another gamma, contrast, brightness, blur and a shadow; beyond [0, 1] too."""
     grey = cv2.pow(np.clip(patch, 0, 1), float(np.exp(rng.uniform(-_LOG_GAMMA_RANGE, _LOG_GAMMA_RANGE))))
     contrast, brightness = rng.uniform(*_CONTRAST_RANGE), rng.uniform(-_BRIGHTNESS_RANGE, _BRIGHTNESS_RANGE)
     grey *= np.float32(contrast)
@@ -304,27 +252,13 @@ def _augment_photometry(patch: Float32Array, rng: np.random.Generator, *, hard: 
         grey = cv2.GaussianBlur(grey, (0, 0), rng.uniform(*_BLUR_SIGMA_PX))
     if rng.random() < _SHADOW_PROBABILITY:
         grey *= 1 - np.float32(rng.uniform(*_SHADOW_DEPTH)) * _random_shadow(rng)
-    if hard and rng.random() < _HAZE_PROBABILITY:
-        share, level = np.float32(rng.uniform(*_HAZE_CONTRAST)), np.float32(rng.uniform(*_HAZE_LEVEL))
-        grey = share * grey + (1 - share) * level
-    if hard and rng.random() < _SHARPENING_PROBABILITY:
-        smooth = cv2.GaussianBlur(grey, (0, 0), rng.uniform(*_SHARPENING_SIGMA_PX))
-        grey += np.float32(rng.uniform(*_SHARPENING)) * (grey - smooth)
-    grey += rng.normal(0, rng.uniform(0, _MAX_NOISE_SD), grey.shape).astype(np.float32)
-    grey = np.clip(grey, 0, 1, out=grey)
-    if hard and rng.random() < _VIDEO_PROBABILITY:
-        grey = _compress(grey, rng)
     return np.asarray(grey, np.float32)
 
 
-def _compress(grey: Float32Array, rng: np.random.Generator) -> Float32Array:
-    """A patch as a frame of video that was made smaller, compressed and made larger again."""
-    side = round(PATCH_PX * rng.uniform(*_VIDEO_REDUCTION))
-    small = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
-    quality = int(rng.integers(*_VIDEO_QUALITY))
-    _, coded = cv2.imencode(".jpg", np.rint(small * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.float32) / 255
-    return np.asarray(cv2.resize(decoded, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_LINEAR), np.float32)
+def add_noise(grey: Float32Array, rng: np.random.Generator) -> Float32Array:
+    """An exposed patch with a sensor's noise, in [0, 1]."""
+    grey += rng.normal(0, rng.uniform(0, _MAX_NOISE_SD), grey.shape).astype(np.float32)
+    return np.asarray(np.clip(grey, 0, 1, out=grey), np.float32)
 
 
 def _random_shadow(rng: np.random.Generator) -> Float32Array:
