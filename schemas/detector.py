@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from schemas.model import Model
+from schemas.scale import CAR_LENGTH_M
 
 Coordinate = Annotated[int, Field(ge=-64, le=64)]
 
@@ -39,7 +40,7 @@ class DetectorConfig(Model):
     """Score threshold; none: chosen in training and stored with the detector."""
     working_car_length_px: PositiveFloat = 16.0
     """Frames are rescaled so that a car is about this long: 8 x 16 px at the paper's 0.23 m a pixel."""
-    car_length_m: PositiveFloat = 4.0
+    car_length_m: PositiveFloat = CAR_LENGTH_M
     """Length of a usual car, which with the ground sample distance sets the working scale."""
     seed: int = Field(0, ge=0)
     """Seed of all random numbers of the training."""

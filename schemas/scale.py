@@ -6,6 +6,8 @@ from pydantic import PositiveFloat, model_validator
 
 from schemas.model import Model
 
+CAR_LENGTH_M = 4.45
+"""Median length of cars on the road: new cars of Europe average 4.4 m, of Korea 4.6 m."""
 ScaleSource = Literal["control_points", "base", "given", "metadata", "vehicles"]
 """``control_points``: of `velfield georeference`; ``base``: the reference system of the image given as ``--base``;
 ``given``: ``--gsd-m``; ``metadata``: the camera's height and focal length; ``vehicles``: the lengths of cars."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.arrays import FloatArray
-from schemas.scale import ScaleEstimate
-from velfield.analysis.vehicle_scale import CAR_LENGTH_M, MIN_VEHICLES, POPULATION_SD, estimate_vehicle_scale
+from schemas.scale import CAR_LENGTH_M, ScaleEstimate
+from velfield.analysis.vehicle_scale import MIN_VEHICLES, POPULATION_SD, estimate_vehicle_scale
 from velfield.sources.scale import choose_scale
 
 GSD_M = 0.23

@@ -18,10 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from schemas.georeference import GeoreferenceRecord
-from schemas.scale import ScaleEstimate
+from schemas.scale import CAR_LENGTH_M, ScaleEstimate
 from schemas.simulation import SimulationConfig, TrafficSimulation
 from velfield import open_run
-from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.pipeline.georeference import plan_of_finished
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan

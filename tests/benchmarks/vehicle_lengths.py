@@ -14,9 +14,9 @@ import argparse
 import numpy as np
 
 from schemas.arrays import FloatArray
-from schemas.scale import ScaleEstimate
+from schemas.scale import CAR_LENGTH_M, ScaleEstimate
 from schemas.simulation import SimulationConfig
-from velfield.analysis.vehicle_scale import CAR_LENGTH_M, POPULATION_SD, TRACK_LENGTH_SD, estimate_vehicle_scale
+from velfield.analysis.vehicle_scale import POPULATION_SD, TRACK_LENGTH_SD, estimate_vehicle_scale
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.model import measure_vehicles
 from velfield.detection.registry import shipped_detector

@@ -258,7 +258,7 @@ def test_a_scale_at_which_no_car_can_be_seen_is_refused(
     """A slip of the decimal point: the search for cars of 2 px takes hours."""
     shutil.copytree(whole[0], tmp_path / "run")
     work = job(flight, tmp_path / "run")
-    with pytest.raises(InputError, match=r"found a scale of 2\.3 m a pixel of the map, at which a car is 1\.7 px long"):
+    with pytest.raises(InputError, match=r"found a scale of 2\.3 m a pixel of the map, at which a car is 1\.9 px long"):
         process(work.model_copy(update={"config": work.config.model_copy(update={"gsd_m": 2.3})}))
 
 

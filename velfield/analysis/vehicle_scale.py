@@ -9,10 +9,8 @@ under which measured lengths are the most likely of such traffic. Its interval h
 import numpy as np
 
 from schemas.arrays import FloatArray
-from schemas.scale import ScaleEstimate
+from schemas.scale import CAR_LENGTH_M, ScaleEstimate
 
-CAR_LENGTH_M = 4.45
-"""Median length of cars on the road: new cars of Europe average 4.4 m, of Korea 4.6 m."""
 POPULATION_SD = 0.03
 """Standard deviation of the logarithm of that over places."""
 MIN_VEHICLES = 20

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.scale import ScaleEstimate
-from velfield.analysis.vehicle_scale import CAR_LENGTH_M
+from schemas.scale import CAR_LENGTH_M, ScaleEstimate
 from velfield.detection.interface import Detector
 from velfield.detection.registry import shipped_detector
 from velfield.detection.scale_search import REFINE_PX, STEP, View, Views, find_scale, is_plausible_scale, spread_windows

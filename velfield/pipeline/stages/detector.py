@@ -13,7 +13,7 @@ import pandas as pd
 from schemas.arrays import GreyImage
 from schemas.detector import CnnConfig
 from schemas.records import WorkingRecord
-from velfield.analysis.vehicle_scale import CAR_LENGTH_M
+from schemas.scale import CAR_LENGTH_M
 from velfield.detection.interface import Detector
 from velfield.detection.registry import load_detector, shipped_detector, train_detector
 from velfield.detection.runtime import use_device
