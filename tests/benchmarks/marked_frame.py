@@ -36,8 +36,8 @@ def main() -> None:
     seen = seen[(seen["frame"] == frame) & (seen["source"] != "interpolated")]
     parked = seen["state"] == "parked"
     sure = seen["score"] >= SURE_SCORE
-    for name, rows in (("move or wait", ~parked), ("parked, sure", parked & sure), ("parked, others", parked & ~sure)):
-        print(f"tracks that are {name}: precision {judge(run, frame, seen[rows])[0]:.3f} of {rows.sum()}")
+    for name, rows in (("move or wait", ~parked), ("stand, sure", parked & sure), ("stand, others", parked & ~sure)):
+        print(f"tracks that {name}: precision {judge(run, frame, seen[rows])[0]:.3f} of {rows.sum()}")
 
 
 def judge(run: Run, frame: int, found: pd.DataFrame) -> tuple[float, dict[str, float]]:

@@ -6,7 +6,7 @@ import pytest
 
 from velfield.tracking.doubtful import find_doubtful, find_lone
 
-METRES = 0.25
+METRES, FRAMES = 0.25, 20
 
 
 class Flight:
@@ -27,10 +27,12 @@ class Flight:
         )
         self.scores[track] = score
 
-    def doubts(self, y_m: float, score: float) -> bool:
-        """Whether a thing that stands there is doubtful; nothing else ever is."""
-        self.add(51, 40.0 + np.random.default_rng(0).normal(0, 0.08, 10), y_m, score)
-        found = find_doubtful(pd.concat(self.positions), pd.Series(self.scores), METRES)
+    def doubts(self, y_m: float, score: float, seen: int = FRAMES) -> bool:
+        """Whether a thing that stands there, and is found in so many frames, is doubtful; nothing else ever is."""
+        self.add(51, 40.0 + np.random.default_rng(0).normal(0, 0.08, seen), y_m, score)
+        found = find_doubtful(
+            pd.concat(self.positions), pd.Series(self.scores), METRES, lambda xy: np.full(len(xy), float(FRAMES))
+        )
         assert set(found.tolist()) <= {51}
         return len(found) > 0
 
@@ -51,8 +53,14 @@ def test_what_stands_needs_a_higher_score_the_farther_it_is_from_vehicles(
     y_m: float, score: float, doubtful: bool
 ) -> None:
     made = Flight()
-    made.add(50, np.full(10, 40.0), 98.0, 0.4)
+    made.add(50, np.full(FRAMES, 40.0), 98.0, 0.4)
     assert made.doubts(y_m, score) == doubtful
+
+
+def test_what_is_found_in_few_of_the_frames_needs_a_higher_score() -> None:
+    assert not Flight().doubts(68.0, 0.15)
+    assert Flight().doubts(68.0, 0.15, seen=FRAMES // 2)
+    assert not Flight().doubts(68.0, 0.26, seen=FRAMES // 2)
 
 
 def test_what_moves_is_never_doubtful() -> None:

@@ -275,7 +275,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=18,
+        version=19,
         label="tracks",
         lines=(
             Line(

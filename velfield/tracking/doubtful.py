@@ -3,10 +3,13 @@ and detections that no track confirms.
 
 A detector reports roof gear, sheds and shadows as well as parked cars, and all of them stand still. What moved is a
 vehicle: its score shows how sure the detector is of vehicles in this flight. A thing that stands next to a sure vehicle
-or where others drove is taken for one; the farther away it stands, the higher a score it needs, up to a limit.
+or where others drove is taken for one; the farther away it stands, and the less often it is found, the higher a score
+it needs, up to a limit. What is found in few of the frames that show its place is mostly a tree or a roof.
 
 A vehicle is found again in the frames before and after, a leaf or a part of a shadow is not.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -25,13 +28,16 @@ _MIN_TRAFFIC = 10
 """Fewer moving vehicles do not give the usual score."""
 _DRIVEN_M = 6.0
 """A thing nearer than this to a path of the traffic stands in a lane or at the kerb."""
-_LEAST, _SLOPE, _SCALE_M, _ENOUGH = -0.51, 0.64, 5.0, 0.7
-"""Least score, over the median score of the traffic, at a distance d from the nearest sure vehicle:
-_LEAST + _SLOPE ln(1 + d / _SCALE_M), which is 0 at 6 m and 0.5 at 19 m; at most _ENOUGH, reached at 28 m.
+_LEAST, _SLOPE, _SCALE_M, _SEEN, _ENOUGH = -0.27, 1.16, 5.0, 1.17, 0.85
+_MANY = 40
+"""Least score, over the median score of the traffic, at a distance d from the nearest sure vehicle, of a thing that is
+found in a fraction s of the frames that show its place, or of `_MANY` of them:
+_LEAST + _SLOPE ln(1 + d / _SCALE_M) - _SEEN s, which is 0 at 12 m and 0.5 at 22 m for what is always found, at 5 and
+11 m for what is found in every other frame; at most _ENOUGH.
 
-By logistic regression on what stands in five simulated cities (736 vehicles, 157 other things) and a clip of 1080p (43,
-100), each flight and each kind weighing alike. Of the cities it keeps 0.997 of the vehicles and 43 other things, of the
-clip 0.930 and 50.
+By logistic regression on what stands in three simulated cities (317 vehicles, 58 other things) and a clip of 1080p (42,
+144), each flight and each kind weighing alike. Of the cities it keeps 0.987 of the vehicles and 5 other things, of the
+clip 0.810 and 44; without s 0.990, 10, 0.833 and 61.
 """
 
 _LONE_RANK = 0.1
@@ -42,7 +48,9 @@ simulated cities 57 and 51 for 3 and 1 of 3,559 and 4,498; of pictures at 2 fram
 """
 
 
-def find_doubtful(positions: pd.DataFrame, score: pd.Series, metres: float) -> IntArray:
+def find_doubtful(
+    positions: pd.DataFrame, score: pd.Series, metres: float, count_views: Callable[[FloatArray], FloatArray]
+) -> IntArray:
     """Tracks of things that are no vehicles more often than not, ascending.
 
     Parameters
@@ -53,6 +61,8 @@ def find_doubtful(positions: pd.DataFrame, score: pd.Series, metres: float) -> I
         Mean score of the detections of each track, by ``track_id``.
     metres
         A base pixel, m.
+    count_views
+        From positions (n, 2), base px, to the number of frames (n,) that show each.
     """
     table = positions.sort_values(["track_id", "time_s"], ignore_index=True)
     groups = table.groupby("track_id")
@@ -71,7 +81,8 @@ def find_doubtful(positions: pd.DataFrame, score: pd.Series, metres: float) -> I
     stands = (displacement_m < _STANDS_M) & (speed_m_per_s < STATIONARY_SPEED_M_PER_S)
     at_road = cKDTree(cells).query(xy_m)[0] < _DRIVEN_M
     distance_m = _distances_to_others(xy_m, scores >= usual)
-    least = np.minimum(_LEAST + _SLOPE * np.log1p(distance_m / _SCALE_M), _ENOUGH)
+    seen = np.minimum(groups.size() / np.clip(count_views(places.to_numpy(np.float64)), 1, _MANY), 1.0)
+    least = np.minimum(_LEAST + _SLOPE * np.log1p(distance_m / _SCALE_M) - _SEEN * seen, _ENOUGH)
     return np.asarray(places.index.to_numpy(np.int64)[stands & ~at_road & (scores < usual * least)])
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from threading import Lock
 
@@ -56,6 +56,8 @@ _CONFIDENCE = 0.95
 _HIDDEN_S = 1.5
 """A track that ends so shortly before the last frame, or begins so shortly after the first, did not vanish."""
 _NO_SIZES = np.empty((0, 4)), np.empty(0, np.int64)
+_VIEWS = 40
+"""Frames by which is judged how many show a place."""
 _AT_ONCE = 4
 """Threads, each of which holds what is stored of one unit's detections."""
 
@@ -85,7 +87,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     if plan.config.tracking.doubt and _has_network(layout):
         seen = positions[positions["source"] < 2]
         scores = mean_scores(plan, seen)
-        doubtful = find_doubtful(seen, scores, gsd_m)
+        doubtful = find_doubtful(seen, scores, gsd_m, partial(_count_views, plan, np.flatnonzero(flight.usable)))
         sure_scores = scores.drop(doubtful)
         del seen
     apart = positions[positions["track_id"].isin(doubtful)].reset_index(drop=True)
@@ -365,6 +367,22 @@ def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSu
     )
 
 
+def _count_views(plan: Plan, frames: IntArray, xy_px: FloatArray) -> FloatArray:
+    """About how many of the frames show each position (n, 2), base px: by some of them, spread over the flight."""
+    maps, some = FrameTransforms.open(plan.layout, plan.config), frames[:: max(1, len(frames) // _VIEWS)]
+    shown = np.zeros(len(xy_px))
+    for frame in some.tolist():
+        transform = maps.transform(frame)
+        if transform is not None:
+            shown += _is_inside(maps, transform.to_raw(xy_px))
+    return shown * len(frames) / max(len(some), 1)
+
+
+def _is_inside(maps: FrameTransforms, raw: FloatArray) -> Mask:
+    """Whether raw positions (..., 2) lie in a frame."""
+    return np.asarray(((raw >= 0) & (raw <= [maps.width - 1, maps.height - 1])).all(axis=-1))
+
+
 def _stays_inside(maps: FrameTransforms, ends: TrackEnds, sign: int, metres: float) -> Mask:
     """Whether vehicles stay inside the frame where they go, or come from, and a little to any side."""
     velocity = sign * ends.velocity_m_per_s
@@ -377,5 +395,5 @@ def _stays_inside(maps: FrameTransforms, ends: TrackEnds, sign: int, metres: flo
         rows, transform = np.flatnonzero(ends.frame == frame), maps.transform(int(frame))
         if transform is not None:
             raw = transform.to_raw(places[:, rows].reshape(-1, 2)).reshape(len(places), len(rows), 2)
-            inside[rows] = ((raw >= 0) & (raw <= [maps.width - 1, maps.height - 1])).all(axis=(0, 2))
+            inside[rows] = _is_inside(maps, raw).all(axis=0)
     return inside
