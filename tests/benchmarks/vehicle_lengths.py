@@ -27,7 +27,7 @@ from velfield.tracking.dimensions import mean_dimensions
 
 _POSITION_SD_PX = 0.7
 """Of a detector, working px."""
-_WORKING_PX_PER_M = 4.0
+_WORKING_PX_PER_M = 16 / CAR_LENGTH_M
 _MIN_FRAMES = 3
 _MARGIN_PX = 12.0
 WRONG = (1.2, 1 / 1.2)
