@@ -1,4 +1,4 @@
-"""Patches for pre-training: what detectors miss most, and what they take for cars.
+"""Patches for pre-training: what detectors miss most.
 
 Added to `PatchDataset`: cars in the tone of the road, cars that the image's edge cuts, inverted polarity (as heat has),
 haze, the halos and the losses of video.

@@ -14,12 +14,14 @@ import argparse
 import numpy as np
 
 from schemas.arrays import FloatArray
+from schemas.detector import CnnConfig
 from schemas.scale import CAR_LENGTH_M, ScaleEstimate
 from schemas.simulation import SimulationConfig
 from velfield.analysis.vehicle_scale import POPULATION_SD, TRACK_LENGTH_SD, estimate_vehicle_scale
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.model import measure_vehicles
 from velfield.detection.registry import shipped_detector
+from velfield.detection.scale_search import working_scale
 from velfield.pipeline.stages.labels import rescale
 from velfield.sources.scale import choose_scale
 from velfield.synthetic.flight import Flight
@@ -27,7 +29,6 @@ from velfield.tracking.dimensions import mean_dimensions
 
 _POSITION_SD_PX = 0.7
 """Of a detector, working px."""
-_WORKING_PX_PER_M = 16 / CAR_LENGTH_M
 _MIN_FRAMES = 3
 _MARGIN_PX = 12.0
 WRONG = (1.2, 1 / 1.2)
@@ -36,7 +37,7 @@ WRONG = (1.2, 1 / 1.2)
 def lengths_of(flight: Flight, gsd_m: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Measured lengths of the vehicles of a flight and their standard deviations, base px, the working grid's scale
     being that of ``gsd_m``."""
-    scale, detector = _WORKING_PX_PER_M * gsd_m, shipped_detector()
+    scale, detector = working_scale(CnnConfig(), gsd_m), shipped_detector()
     assert isinstance(detector, CnnDetector)
     sizes, vehicles = [], []
     for frame in range(flight.config.frames):

@@ -298,7 +298,8 @@ def test_one_crossing_is_no_crossings(page: Page, address: str, run: Run) -> Non
     lines = ((x - 4, y - 4, x + 4, y + 4) for x, y in middle.tolist())
     ends = next(line for line in lines if len(run.crossings(line[:2], line[2:])) == 1)
     page.open(f"{address}#line={','.join(map(str, ends))}")
-    page.wait("document.querySelector('#answer .note')?.textContent.includes('; 1 crossing in ')")
+    page.wait("document.querySelector('#answer .note')?.textContent.includes('; 1 crossing')")
+    assert "; 1 crossing in " in page.value("document.querySelector('#answer .note').textContent")
 
 
 def test_a_line_is_drawn_by_two_clicks_and_by_the_keyboard(page: Page, address: str) -> None:

@@ -20,7 +20,7 @@ STATES = ("moving", "stopped", "parked")
 none, or no vehicle at all."""
 SURE_SCORE = 0.15
 """Of the parked ones with this mean score, by the shipped network, or more, 15 of 18 in a frame of a clip of 1080p are
-vehicles, and 83 of 83 in a simulated city; of those with less 24 of 64, and 2 of 7."""
+vehicles, and 83 of 83 in a simulated city; of those with less 24 of 58, and 2 of 7."""
 _MOVED_SIGMAS = 4.0
 """A shorter one counts where it is so many standard deviations, at more than a stationary vehicle's speed."""
 _CELL_M, _SECTOR_RAD = 0.5, np.pi / 12

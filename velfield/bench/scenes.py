@@ -5,6 +5,7 @@ import numpy as np
 
 from schemas.detector import CnnConfig
 from velfield.detection.samples import LabelledImage
+from velfield.detection.scale_search import working_scale
 from velfield.synthetic.cases import small_flight
 
 
@@ -18,7 +19,7 @@ def simulated_image(seed: int, large_share: float | None = None) -> LabelledImag
     }
     traffic = {} if large_share is None else {"large_share": large_share}
     flight = small_flight(frames=1, seed=seed, scene=scene, traffic=traffic)
-    factor = 16.0 * flight.config.gsd_m / CnnConfig().car_length_m
+    factor = working_scale(CnnConfig(), flight.config.gsd_m)
     cars = flight.labels(0)[["x_px", "y_px", "orientation_rad", "length_px", "width_px"]].to_numpy(copy=True)
     cars[:, :2] = (cars[:, :2] + 0.5) * factor - 0.5
     cars[:, 3:] *= factor

@@ -152,7 +152,7 @@ def _parked_notes(plan: Plan, states: dict[str, float]) -> list[str]:
     if read_working(plan.layout).training_source == "shipped":
         note += (
             f" With a mean score of {SURE_SCORE:g} or more: {states['parked_sure']:.0f}. In the two flights where it "
-            "was checked, a town and a simulated city, 0.83 and 1.0 of such were vehicles, and 0.38 and 0.29 of the "
+            "was checked, a town and a simulated city, 0.83 and 1.0 of such were vehicles, and 0.41 and 0.29 of the "
             "others; of this flight it is not known."
         )
     return [note]

@@ -16,7 +16,7 @@ from velfield.detection.registry import load_detector
 from velfield.parallel import parallel_map, usable_processors
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.pipeline.stages.registration import usable_frames
+from velfield.pipeline.stages.registration import spread_usable_frames, usable_frames
 from velfield.pipeline.stages.tracklets import (
     UnitDetections,
     among,
@@ -87,7 +87,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     if plan.config.tracking.doubt and _has_network(layout):
         seen = positions[positions["source"] < 2]
         scores = mean_scores(plan, seen)
-        doubtful = find_doubtful(seen, scores, gsd_m, partial(_count_views, plan, np.flatnonzero(flight.usable)))
+        doubtful = find_doubtful(seen, scores, gsd_m, partial(_count_views, plan, int(flight.usable.sum())))
         sure_scores = scores.drop(doubtful)
         del seen
     apart = positions[positions["track_id"].isin(doubtful)].reset_index(drop=True)
@@ -367,15 +367,15 @@ def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSu
     )
 
 
-def _count_views(plan: Plan, frames: IntArray, xy_px: FloatArray) -> FloatArray:
-    """About how many of the frames show each position (n, 2), base px: by some of them, spread over the flight."""
-    maps, some = FrameTransforms.open(plan.layout, plan.config), frames[:: max(1, len(frames) // _VIEWS)]
+def _count_views(plan: Plan, count: int, xy_px: FloatArray) -> FloatArray:
+    """About how many of so many frames show each position (n, 2), base px: by some, spread over the flight."""
+    maps, frames = FrameTransforms.open(plan.layout, plan.config), spread_usable_frames(plan, _VIEWS)
     shown = np.zeros(len(xy_px))
-    for frame in some.tolist():
+    for frame in frames:
         transform = maps.transform(frame)
-        if transform is not None:
-            shown += _is_inside(maps, transform.to_raw(xy_px))
-    return shown * len(frames) / max(len(some), 1)
+        assert transform is not None, "a usable frame is registered"
+        shown += _is_inside(maps, transform.to_raw(xy_px))
+    return shown * count / max(len(frames), 1)
 
 
 def _is_inside(maps: FrameTransforms, raw: FloatArray) -> Mask:

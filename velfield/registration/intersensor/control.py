@@ -18,7 +18,13 @@ from schemas.flight import BaseConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
 from velfield.registration.fitting import Model, fit_by_case_deletion, fit_polyprojective
-from velfield.registration.intersensor.coarse import CoarseCandidate, downscale, sift_keypoints
+from velfield.registration.intersensor.coarse import (
+    CoarseCandidate,
+    SiftHomography,
+    downscale,
+    estimate_sift_homography,
+    sift_keypoints,
+)
 from velfield.registration.intersensor.correlation import GridMatches, match_grid
 from velfield.registration.intersensor.modality import GRADIENT, Modality
 from velfield.registration.keypoints import Keypoints
@@ -52,6 +58,13 @@ class ImagePair:
     def base_keypoints(self) -> Keypoints:
         """Keypoints of the base image, to which the frame's are matched in each modality, and mirrored."""
         return sift_keypoints(self.base, self.config.coarse_scale)
+
+    @cached_property
+    def flipped(self) -> SiftHomography:
+        """SIFT matches of the flipped frame to the base image."""
+        return estimate_sift_homography(
+            self.image, self.base_keypoints, self.lens, scale=self.config.coarse_scale, mirrored=True
+        )
 
     def transform(self, polyprojective: PolyprojectiveTransform) -> FrameTransform:
         """The frame's map, raw px to base px: the lens, then a transform of undistorted px."""

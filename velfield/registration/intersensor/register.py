@@ -21,7 +21,6 @@ from velfield.registration.fitting import Model
 from velfield.registration.intersensor.coarse import (
     MIN_INLIERS,
     CoarseCandidate,
-    SiftHomography,
     estimate_sift_homography,
     search_similarity,
 )
@@ -145,22 +144,16 @@ def register_intersensor(
         if count >= config.min_control_points and verification.is_verified:
             if candidate.is_blind and not verification.is_certain:
                 continue  # a town of equal blocks matches another place of its own kind, with up to 0.43 of the patches
-            if not verification.is_certain and _match_flipped(pair).matrix is not None:
+            if not verification.is_certain and pair.flipped.matrix is not None:
                 break  # straight roads match their own mirror image well enough to pass the verification
             return _to_result(pair, fit, candidate, tuple(scores))
     return Failure(_explain_failure(pair, scores))
 
 
-def _match_flipped(pair: ImagePair) -> SiftHomography:
-    """SIFT matches of the flipped frame to the base image."""
-    scale = pair.config.coarse_scale
-    return estimate_sift_homography(pair.image, pair.base_keypoints, pair.lens, scale=scale, mirrored=True)
-
-
 def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
     """Message with the cause of a failed registration, and what to do."""
     _LOG.debug("no candidate is verified: %s", "; ".join(scores))
-    flipped = _match_flipped(pair)
+    flipped = pair.flipped
     if flipped.matrix is not None:
         return f"{MIRRORED} ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
     return (
