@@ -24,7 +24,7 @@ test: export OMP_NUM_THREADS := 1
 test: page  ## every check: lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python -m velfield.pipeline.local & kernels=$$!; $(BIN)/mypy && wait $$kernels || { kill $$kernels; exit 1; }
+	$(BIN)/python -m velfield.pipeline.compile_kernels & kernels=$$!; $(BIN)/mypy && wait $$kernels || { kill $$kernels; exit 1; }
 	$(BIN)/python -m pytest $(IN_TWO)
 
 # In build/newest and build/oldest, without the lock: what somebody gets who installs the wheel today, or beside old

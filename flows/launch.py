@@ -135,7 +135,7 @@ def kernels_beside() -> Iterator[None]:
     if any(cache_root().rglob("*.nbi")):
         yield
         return
-    command = [sys.executable, "-m", "velfield.pipeline.local"]
+    command = [sys.executable, "-m", "velfield.pipeline.compile_kernels"]
     with Popen(command, stdout=DEVNULL, stderr=DEVNULL) as beside:
         try:
             yield

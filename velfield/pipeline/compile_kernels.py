@@ -1,0 +1,71 @@
+"""Have the kernels compiled: ``python -m velfield.pipeline.compile_kernels``.
+
+Two tiny jobs are run and discarded; what numba compiles on the way is cached beside the modules. The first job begins
+at what a run needs last, so that a first real run beside it, which begins at its frames, meets it half way.
+"""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from schemas.flight import FlightConfig
+from schemas.job import Inputs, Job
+from schemas.simulation import SimulationConfig
+from velfield.pipeline.analysis.analyse import analyse_run
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
+from velfield.pipeline.graphs import compute_here, tracks_graph
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import make_plan, write_flight_record
+from velfield.pipeline.units import prepare_stage, stage_units
+
+_FLIGHT = SimulationConfig(frames=9, width=480, height=360, seed=3)
+_QUICK = {"detection.fine_tune_steps": 2, "registration.max_keypoints": 800, "gsd_m": 0.23}
+_SPEED_M_PER_S, _LENGTH_M, _EVERY_S, _VEHICLES = 10.0, 60.0, 2.0, 8
+
+
+def compile_kernels() -> None:
+    """Run both jobs: tracks to an analysis, then a simulated flight from its first frame to its maps."""
+    with tempfile.TemporaryDirectory(prefix="velfield-kernels-") as folder:
+        _process_tracks(Path(folder))
+        _process_flight(Path(folder))
+
+
+def _process_tracks(folder: Path) -> None:
+    tracks, run = folder / "tracks.csv", folder / "run-of-tracks"
+    _crossing_streets().to_csv(tracks, index=False)
+    plan = plan_tracks(Job(root=str(run), inputs=Inputs(source=str(tracks)), config=FlightConfig()))
+    write_flight_record(plan)
+    for stage in list_track_stages():
+        prepare_stage(plan, stage)
+        for unit in stage_units(plan, stage):
+            compute_here(tracks_graph(plan, stage, unit))
+    for _ in analyse_run(run):
+        pass
+
+
+def _crossing_streets() -> pd.DataFrame:
+    """Vehicles that follow each other on two streets, which cross."""
+    vehicle, along_m = np.mgrid[: 2 * _VEHICLES, 0 : _LENGTH_M : _SPEED_M_PER_S / 5].reshape(2, -1)
+    east = vehicle % 2 == 0
+    x_m, y_m = np.where(east, [along_m, np.full_like(along_m, 30)], [np.full_like(along_m, 30), along_m])
+    time_s = vehicle // 2 * _EVERY_S + along_m / _SPEED_M_PER_S
+    return pd.DataFrame({"id": vehicle.astype(int), "time_s": time_s, "x_m": x_m, "y_m": y_m, "length_m": 4.5})
+
+
+def _process_flight(folder: Path) -> None:
+    from velfield.synthetic.write import write_flight
+
+    flight = folder / "flight"
+    write_flight(flight, _FLIGHT)
+    config = resolve_config(preset="fast", overrides=_QUICK)
+    job = Job(root=str(folder / "run"), inputs=Inputs.from_simulated_flight(flight), config=config)
+    plan = make_plan(job)
+    write_flight_record(plan)
+    compute_stages(plan)
+
+
+if __name__ == "__main__":
+    compile_kernels()
