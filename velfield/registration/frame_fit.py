@@ -10,12 +10,7 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
-from velfield.registration.alignment import (
-    Templates,
-    align_patches,
-    smooth_coarse,
-    smooth_fine,
-)
+from velfield.registration.alignment import Templates, align_patches, smooth_coarse, smooth_fine
 from velfield.registration.control_points import ControlPoints, is_inlier, rms
 from velfield.registration.fitting import fit_by_case_deletion
 from velfield.registration.joint import JointFit, fit_jointly

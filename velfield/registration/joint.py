@@ -346,15 +346,7 @@ def _weights_and_scale(
 
 
 def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> FloatArray:
-    """Robust weights (n,) of residuals (n, 2), as at the end of the joint fit.
-
-    Parameters
-    ----------
-    sigma
-        (n,) of the control points.
-    scale
-        `JointFit.scale`.
-    """
+    """Robust weights (n,) of residuals (n, 2) over ``sigma`` (n,) and `JointFit.scale`, as in its last step."""
     return geman_mcclure(np.hypot(*residuals.T) / (sigma * scale * _ANNEALING[-1]))
 
 
@@ -455,10 +447,7 @@ def _take_step(
     weights: FloatArray,
     stiffness: tuple[float, float],
 ) -> _State | Failure:
-    """One Gauss-Newton step, halved until every control point of positive weight stays in the map's domain.
-
-    Returns the state itself if no halving suffices; a failure if the control points do not determine the map.
-    """
+    """One Gauss-Newton step, halved until all control points of positive weight are mapped; else the state itself."""
     (step,) = problem.steps(equations, state.theta, stiffness, leave_out=False)
     if not np.isfinite(step).all():
         return Failure(f"{len(weights)} control points do not determine the map: they lie on a line or in one place")

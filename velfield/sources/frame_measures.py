@@ -14,12 +14,9 @@ class FrameQuality:
 
     Attributes
     ----------
-    sharpness
-        Standard deviation of the Laplacian, grey levels.
-    brightness
-        Mean grey level.
-    thumbnail
-        (16, 16) float32, the frame scaled down, its mean removed: what `flag_outlier_frames` correlates.
+    sharpness : standard deviation of the Laplacian, grey levels.
+    brightness : mean grey level.
+    thumbnail : (16, 16) float32, the frame scaled down, its mean removed: what `flag_outlier_frames` correlates.
     """
 
     sharpness: float

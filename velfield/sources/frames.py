@@ -68,18 +68,12 @@ class SourceFrame:
 
     Attributes
     ----------
-    source_index
-        Its index in `SourceInfo`, in order of time.
-    name
-        An image's file name, or a video's 0-based frame index, as text: its name in labels.
-    time_s
-        True time, s: the container's, the CSV's, or index / fps with --fps.
-    grey
-        (h, w) uint8, raw pixels as stored (no EXIF rotation); zeros where it is unreadable.
-    flags
-        Bits of `velfield.sources.quality.FrameFlag`.
-    reason
-        The fault, in one line, without the frame's name; empty if there was none.
+    source_index : its index in `SourceInfo`, in order of time.
+    name : an image's file name, or a video's 0-based frame index, as text: its name in labels.
+    time_s : true time, s: the container's, the CSV's, or index / fps with --fps.
+    grey : (h, w) uint8, raw pixels as stored (no EXIF rotation); zeros where it is unreadable.
+    flags : bits of `velfield.sources.quality.FrameFlag`.
+    reason : the fault, in one line, without the frame's name; empty if there was none.
     """
 
     source_index: int
@@ -102,36 +96,22 @@ class SourceInfo:
 
     Attributes
     ----------
-    kind
-        ``video`` or ``folder``.
-    width, height
-        Size of every frame, px.
-    frame_count
-        Number of frames that can be read.
-    times_s
-        (n,) float64, ascending, s; it may hold equal times, of which `select_frames` takes the first.
-    names
-        (n,) name of each frame in labels: file names, or indices as text.
-    warnings
-        One line each, for the user: frames missing, out of order, or truncated; what is lost is a `FootageLoss`.
-    declared_count
-        Number of frames that the container declares, if it does.
-    pts
-        (n,) int64 presentation time stamps of a video's frames in `time_base` units; empty for a folder and for a
+    kind : ``video`` or ``folder``.
+    width, height : size of every frame, px.
+    frame_count : number of frames that can be read.
+    times_s : (n,) float64, ascending, s; it may hold equal times, of which `select_frames` takes the first.
+    names : (n,) name of each frame in labels: file names, or indices as text.
+    warnings : one line each, for the user: frames missing, out of order, or truncated; what is lost is a `FootageLoss`.
+    declared_count : number of frames that the container declares, if it does.
+    pts : (n,) int64 presentation time stamps of a video's frames in `time_base` units; empty for a folder and for a
         video without times. With the file, a frame's identity.
-    key_frames
-        (n,) bool, key frames, where corruption ends; empty as `pts`.
-    entries
-        (n,) bool, key frames of closed groups of pictures, where decoding can start.
-    fps
-        Frame rate behind the times, where the user gave one and the source had none.
-    max_pixels
-        Limit on the size of an image, refused before memory is taken.
-    levels
-        Levels of frames of more than 8 bits that become 0 and 255 in every frame.
-    parts
-        Parts of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the start
-        of the first.
+    key_frames : (n,) bool, key frames, where corruption ends; empty as `pts`.
+    entries : (n,) bool, key frames of closed groups of pictures, where decoding can start.
+    fps : frame rate behind the times, where the user gave one and the source had none.
+    max_pixels : limit on the size of an image, refused before memory is taken.
+    levels : levels of frames of more than 8 bits that become 0 and 255 in every frame.
+    parts : parts of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the
+        start of the first.
     """
 
     kind: SourceKind

@@ -35,16 +35,12 @@ class BaseRaster:
 
     Attributes
     ----------
-    grey
-        (h, w) uint8: the base image; its pixels are base pixels.
-    valid
-        (h, w) bool, False where there is no data; None where all pixels have some.
-    crs_wkt, affine, gsd_m
-        Reference system; (a, b, c, d, e, f) from (column, row) of pixel corners to its coordinates, as rasterio's
-        `Affine`; metres a pixel by the reference system's local scale at the centre. None without a reference system;
-        of a local one, which has metres but no place on Earth, only ``gsd_m`` is known.
-    notes
-        Notes on what was changed or is not used, one line each.
+    grey : (h, w) uint8: the base image; its pixels are base pixels.
+    valid : (h, w) bool, False where there is no data; None where all pixels have some.
+    crs_wkt, affine, gsd_m : reference system; (a, b, c, d, e, f) from (column, row) of pixel corners to its
+        coordinates, as rasterio's `Affine`; metres a pixel by the reference system's local scale at the centre. None
+        without a reference system; of a local one, which has metres but no place on Earth, only ``gsd_m`` is known.
+    notes : notes on what was changed or is not used, one line each.
     """
 
     grey: GreyImage

@@ -68,8 +68,7 @@ def read_csv_rows(
         if len(row) != len(header):
             raise InputError(
                 f"{path.name}: line {reader.line_num}: found {len(row)} cells, expected {len(header)} "
-                f"({','.join(header)}); "
-                f"fix line {reader.line_num}"
+                f"({','.join(header)}); fix line {reader.line_num}"
             )
         yield reader.line_num, {name: cell.strip() for name, cell in zip(header, row, strict=True)}
 

@@ -62,6 +62,5 @@ def check_against_container(side_s: FloatArray, container_s: FloatArray, path: P
     if limit > 0 and abs(difference[worst]) > limit:
         raise InputError(
             f"{path.name}: found frame {worst} {side_s[worst] - side_s[0]:.3f} s after the first, expected "
-            f"{container_s[worst] - container_s[0]:.3f} s by the video's own times; omit --timestamps or "
-            "fix it"
+            f"{container_s[worst] - container_s[0]:.3f} s by the video's own times; omit --timestamps or fix it"
         )

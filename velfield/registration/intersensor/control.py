@@ -28,11 +28,7 @@ from velfield.registration.intersensor.coarse import (
 from velfield.registration.intersensor.correlation import GridMatches, match_grid
 from velfield.registration.intersensor.modality import GRADIENT, Modality
 from velfield.registration.keypoints import Keypoints
-from velfield.registration.transforms import (
-    FrameTransform,
-    HomographyTransform,
-    PolyprojectiveTransform,
-)
+from velfield.registration.transforms import FrameTransform, HomographyTransform, PolyprojectiveTransform
 from velfield.registration.warp import footprint, warp_to_base
 
 FINE_RADIUS_PX = 10

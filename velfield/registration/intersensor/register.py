@@ -67,23 +67,16 @@ class IntersensorResult:
 
     Attributes
     ----------
-    transform
-        Raw px -> base px: lens, then polyprojective.
-    model
-        The model of lower cross-validated error.
-    source_raw, target, cv_errors_px
-        (n, 2) raw px, (n, 2) base px, (n,) base px: control points and the cross-validated error of each.
-    mean_error_px, cv_error_px
-        Mean distance of the control points from the fit, and cross-validated, base px.
-    scale, rotation_rad
-        Base px per frame px at the frame's centre, and rotation there, from +x towards +y.
-    method
-        How the coarse candidate was found.
-    scores
-        The verification of each candidate, in words.
-    error_map, error_map_spacing_px
-        (rows, columns) float32 mean cross-validated error about each node of a grid over the base image, base px; NaN
-        where no control point is near. Node (i, j) lies at base (j, i) times the spacing.
+    transform : raw px -> base px: lens, then polyprojective.
+    model : the model of lower cross-validated error.
+    source_raw, target, cv_errors_px : (n, 2) raw px, (n, 2) base px, (n,) base px: control points and the
+        cross-validated error of each.
+    mean_error_px, cv_error_px : mean distance of the control points from the fit, and cross-validated, base px.
+    scale, rotation_rad : base px per frame px at the frame's centre, and rotation there, from +x towards +y.
+    method : how the coarse candidate was found.
+    scores : the verification of each candidate, in words.
+    error_map, error_map_spacing_px : (rows, columns) float32 mean cross-validated error about each node of a grid over
+        the base image, base px; NaN where no control point is near. Node (i, j) lies at base (j, i) times the spacing.
     """
 
     transform: FrameTransform

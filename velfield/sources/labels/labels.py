@@ -59,14 +59,10 @@ class Labels:
 
     Attributes
     ----------
-    cars
-        Columns of `schemas.tables.LABEL_COLUMNS`.
-    ignored
-        The same columns for objects of other classes: neither cars nor background.
-    frames
-        Every frame that is named, in the source's order, also those without a car; each is fully labelled.
-    notes
-        One line each, for the user: which classes are cars, how images were matched with frames.
+    cars : columns of `schemas.tables.LABEL_COLUMNS`.
+    ignored : the same columns for objects of other classes: neither cars nor background.
+    frames : every frame that is named, in the source's order, also those without a car; each is fully labelled.
+    notes : one line each, for the user: which classes are cars, how images were matched with frames.
     """
 
     cars: pd.DataFrame
@@ -177,8 +173,7 @@ def _read_files(path: Path, info: SourceInfo, what: str) -> tuple[list[Box], lis
         first = repr(next(iter(found.images))) if found.images else "none"
         raise InputError(
             f"{path.name}: found labels of the images {first} and others, but no frame of this source has such a "
-            "name (they are named "
-            f"{info.names[0]!r} and so on); rename them"
+            f"name (they are named {info.names[0]!r} and so on); rename them"
         )
     drawn = [one for one in found.annotations if one.image in frame_of]
     names, origin = dict[int, str](), path.name

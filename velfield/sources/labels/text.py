@@ -29,19 +29,8 @@ def text_kind(path: Path) -> str | None:
 
 
 _VISDRONE = (
-    *(
-        "ignored regions",
-        "pedestrian",
-        "people",
-        "bicycle",
-        "car",
-        "van",
-        "truck",
-        "tricycle",
-        "awning-tricycle",
-        "bus",
-    ),
-    *("motor", "others"),
+    *("ignored regions", "pedestrian", "people", "bicycle", "car", "van", "truck", "tricycle", "awning-tricycle"),
+    *("bus", "motor", "others"),
 )
 
 

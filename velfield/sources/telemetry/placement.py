@@ -162,10 +162,9 @@ class Place:
 
     Attributes
     ----------
-    crs_wkt, affine
-        The UTM zone, and (column, row) of pixel corners to its coordinates, as `velfield.sources.geo.BaseRaster`.
-    sd_m
-        Standard deviation of a position in either direction, m.
+    crs_wkt, affine : the UTM zone, and (column, row) of pixel corners to its coordinates, as
+        `velfield.sources.geo.BaseRaster`.
+    sd_m : standard deviation of a position in either direction, m.
     """
 
     crs_wkt: str

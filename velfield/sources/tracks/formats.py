@@ -38,24 +38,16 @@ class TrackFormat:
 
     Attributes
     ----------
-    name
-        As it is printed.
-    needs
-        Columns by which it is recognised; the first format of `FORMATS` whose columns are all there is taken.
-    track
-        Columns that name a vehicle together, where they exist.
-    positions
-        In order of preference; the first that has numbers is read, unless ``--unit`` asks for another.
-    times, frame
-        Columns of the time with their units (None: by the values), and of the frame.
-    point
-        Point of the vehicle that a position gives. A corner is the upper left one of a box; its sizes are in ``size``.
-    speed
-        The speed by the file, with which the positions are compared.
-    size
-        Columns of length (along x of a box) and width, and metres in their unit.
-    frame_rate
-        Usual frames a second, for the message that asks for them.
+    name : as it is printed.
+    needs : columns by which it is recognised; the first format of `FORMATS` whose columns are all there is taken.
+    track : columns that name a vehicle together, where they exist.
+    positions : in order of preference; the first that has numbers is read, unless ``--unit`` asks for another.
+    times, frame : columns of the time with their units (None: by the values), and of the frame.
+    point : point of the vehicle that a position gives. A corner is the upper left one of a box; its sizes are in
+        ``size``.
+    speed : the speed by the file, with which the positions are compared.
+    size : columns of length (along x of a box) and width, and metres in their unit.
+    frame_rate : usual frames a second, for the message that asks for them.
     """
 
     name: str
@@ -223,33 +215,15 @@ MOT_COLUMNS = ("mot frame", "mot id", "bb left", "bb top", "bb width", "bb heigh
 
 RECORDINGS = ("recordingid", "recording", "caseid", "scenarioid")
 """Columns that are part of a vehicle's name in any table."""
-PLACES: tuple[str, ...] = (
-    "location",
-    "locationid",
-    "droneid",
-    "cameraid",
-    "camera",
-    "video",
-    "file",
-    "filename",
-    "clip",
-    "scene",
+PLACES = (
+    *("location", "locationid", "droneid", "cameraid", "camera", "video", "file", "filename", "clip", "scene"),
+    *("session", "cityname", "city", "sequence", "run", "date", "day", "intid", "site"),
 )
-PLACES = (*PLACES, "session", "cityname", "city", "sequence", "run", "date", "day", "intid", "site")
 """Columns that are part of it where a vehicle would otherwise be at two places at one time."""
-TRACKS: tuple[str, ...] = (
-    "trackid",
-    "vehicleid",
-    "track",
-    "id",
-    "vehicle",
-    "objectid",
-    "objid",
-    "recordingtrackid",
-    "carid",
-    "vehid",
+TRACKS = (
+    *("trackid", "vehicleid", "track", "id", "vehicle", "objectid", "objid", "recordingtrackid", "carid", "vehid"),
+    *("agentid", "trajectoryid", "trajid", "tid"),
 )
-TRACKS = (*TRACKS, "agentid", "trajectoryid", "trajid", "tid")
 FRAMES = ("frame", "frameid", "framenum", "framenumber", "frameno", "frameindex")
 TIMES: tuple[tuple[str, TimeUnit | None], ...] = (
     *((name, "s") for name in ("times", "timestamps", "globaltimes", "time[s]", "timestamp[s]", "t[s]", "times[s]")),
@@ -259,16 +233,12 @@ TIMES: tuple[tuple[str, TimeUnit | None], ...] = (
     *((name, None) for name in ("time", "timestamp", "datetime", "timestamputc", "utctime", "timeutc", "localtime")),
     *((name, None) for name in ("globaltime", "epoch", "epochtime", "unixtime", "t", "timesteptime", "date")),
 )
-_PAIRS: tuple[tuple[str, str], ...] = (
-    ("x", "y"),
-    ("xcenter", "ycenter"),
-    ("centerx", "centery"),
-    ("xcentre", "ycentre"),
-    ("centrex", "centrey"),
+_PAIRS = (
+    *(("x", "y"), ("xcenter", "ycenter"), ("centerx", "centery"), ("xcentre", "ycentre"), ("centrex", "centrey")),
+    *(("posx", "posy"), ("positionx", "positiony"), ("xpos", "ypos"), ("cx", "cy"), ("xc", "yc")),
+    *(("vehiclex", "vehicley"), ("localx", "localy"), ("globalx", "globaly"), ("xlocal", "ylocal")),
+    ("carcenterx", "carcentery"),
 )
-_PAIRS = (*_PAIRS, ("posx", "posy"), ("positionx", "positiony"), ("xpos", "ypos"), ("cx", "cy"), ("xc", "yc"))
-_PAIRS = (*_PAIRS, ("vehiclex", "vehicley"), ("localx", "localy"), ("globalx", "globaly"), ("xlocal", "ylocal"))
-_PAIRS = (*_PAIRS, ("carcenterx", "carcentery"))
 POSITIONS = (
     Position("xm", "ym", "m", "down"),
     *(Position(x, y, "m", "up") for x, y in (("eastm", "northm"), ("utmx", "utmy"), ("xutm", "yutm"))),

@@ -47,19 +47,13 @@ class GivenPositions:
 
     Attributes
     ----------
-    table
-        ``track_id`` (int) and ``source_id``, its name in the file, ``frame`` (int), ``time_s`` from 0 on, ``x``, ``y``
-        with y downwards; ``length_m``, ``width_m`` where the file has them (NaN: not known); by track and time.
-    unit
-        Unit of ``x`` and ``y``: ``m`` or ``px``.
-    y_axis
-        Where y points in the file.
-    crs_wkt
-        Reference system of ``x`` and ``-y``: a UTM zone where the file has degrees; None: none.
-    speed
-        Speeds of the rows by the file.
-    notes
-        Notes on what was read and noticed, one line each.
+    table : ``track_id`` (int) and ``source_id``, its name in the file, ``frame`` (int), ``time_s`` from 0 on, ``x``,
+        ``y`` with y downwards; ``length_m``, ``width_m`` where the file has them (NaN: not known); by track and time.
+    unit : unit of ``x`` and ``y``: ``m`` or ``px``.
+    y_axis : where y points in the file.
+    crs_wkt : reference system of ``x`` and ``-y``: a UTM zone where the file has degrees; None: none.
+    speed : speeds of the rows by the file.
+    notes : notes on what was read and noticed, one line each.
     """
 
     table: pd.DataFrame

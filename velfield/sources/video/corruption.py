@@ -172,8 +172,7 @@ class CorruptionTracker:
 
     Attributes
     ----------
-    last_error
-        libav's last message.
+    last_error : libav's last message.
     """
 
     def __init__(self, *, lasting: bool = False, midway: bool = False) -> None:

@@ -98,8 +98,7 @@ def _times_from_csv(
     if missing:
         raise InputError(
             f"{timestamps.name}: found no time for {len(missing)} of {count} frames of {path.name} (first: "
-            f"{missing[0]}), "
-            "expected the 0-based frame index as `frame`; add them"
+            f"{missing[0]}), expected the 0-based frame index as `frame`; add them"
         )
     times_s = np.array([given[str(index)] for index in range(count)])
     if container_s is not None:
