@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from velfield.analysis.regions import Regions, keep_large, label_smooth, region_table
 
+_MAX_STEP_RAD = math.radians(15)
+"""Largest change of direction between neighbouring pixels."""
+
 
 def find_carriageways(
     direction_rad: NDArray[np.floating],
@@ -15,7 +18,6 @@ def find_carriageways(
     *,
     speeds_px_per_s: Mapping[str, NDArray[np.floating]] | None = None,
     min_count: int = 3,
-    max_step_rad: float = math.radians(15),
     min_area_px: int = 200,
 ) -> Regions:
     """Connected pixels whose direction changes smoothly: a carriageway may bend, the opposite one is another.
@@ -30,8 +32,6 @@ def find_carriageways(
         (h, w) speed layers by name (``p50``, ``p85``), of which the table gives medians.
     min_count
         Fewest tracks of a pixel: a single track is no lane.
-    max_step_rad
-        Largest change of direction between neighbouring pixels.
     min_area_px
         Smaller regions are dropped, px.
 
@@ -42,7 +42,7 @@ def find_carriageways(
         ``straightness`` (resultant length of the directions: 1 all equal, 0 a full circle).
     """
     direction = np.where(count >= min_count, direction_rad, np.nan).astype(np.float64)
-    labels = keep_large(label_smooth(direction, max_step_rad), min_area_px=min_area_px)
+    labels = keep_large(label_smooth(direction, _MAX_STEP_RAD), min_area_px=min_area_px)
     layers: dict[str, NDArray[np.floating]] = {"tracks": np.asarray(count, np.float64)}
     for name, speed in (speeds_px_per_s or {}).items():
         layers[f"speed_{name}_px_per_s"] = speed

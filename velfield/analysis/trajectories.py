@@ -157,14 +157,14 @@ class Trajectories:
         )
 
 
-def moving(trajectories: Trajectories, *, min_extent_m: float = MOVES_M) -> Trajectories:
-    """The tracks that reach so far: of vehicles that move."""
+def moving(trajectories: Trajectories) -> Trajectories:
+    """The tracks that reach `MOVES_M` or farther: of vehicles that move."""
     if not len(trajectories):
         return trajectories
     low, high = (
         reduce.reduceat(trajectories.xy_m, trajectories.first[:-1], axis=0) for reduce in (np.minimum, np.maximum)
     )
-    return trajectories.select(np.hypot(*(high - low).T) >= min_extent_m)
+    return trajectories.select(np.hypot(*(high - low).T) >= MOVES_M)
 
 
 def make_trajectories(
@@ -350,16 +350,16 @@ def group_rows(group: IntArray, n: int) -> tuple[IntArray, IntArray]:
     return np.argsort(small, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(group, minlength=n))])
 
 
-def sample_paths(trajectories: Trajectories, spacing_m: float = SAMPLES_M) -> PathSamples:
-    """Points every ``spacing_m`` along each track; a stationary vehicle gives none."""
+def sample_paths(trajectories: Trajectories) -> PathSamples:
+    """Points every `SAMPLES_M` along each track; a stationary vehicle gives none."""
     first, xy, speed = trajectories.first, trajectories.xy_m, trajectories.speed_m_per_s
-    border = np.r_[0, np.cumsum(_count_samples(first, xy, spacing_m, _MIN_STEP_M))].astype(np.int64)
+    border = np.r_[0, np.cumsum(_count_samples(first, xy, SAMPLES_M, _MIN_STEP_M))].astype(np.int64)
     n = int(border[-1])
     out = PathSamples(np.empty(n, np.int64), np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n))
 
     def fill(tracks: IntArray) -> None:
         columns = out.track, out.xy_m, out.direction_rad, out.time_s, out.speed_m_per_s
-        _resample(tracks, first, trajectories.time_s, xy, speed, border, spacing_m, _DIRECTION_M, _MIN_STEP_M, *columns)
+        _resample(tracks, first, trajectories.time_s, xy, speed, border, SAMPLES_M, _DIRECTION_M, _MIN_STEP_M, *columns)
 
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(fill, np.array_split(np.arange(len(trajectories)), _THREADS)))

@@ -146,12 +146,11 @@ def png_bytes(image: NDArray[np.uint8]) -> bytes:
     return _saved(Image.fromarray(image), "PNG", compress_level=2)
 
 
-def jpeg_bytes(rgb: RGBImage, *, quality: int = 88, max_side: int | None = None) -> bytes:
+def jpeg_bytes(rgb: RGBImage, *, max_side: int) -> bytes:
     """An RGB image as JPEG, reduced so that no side is longer than ``max_side``: for small pages."""
     image = Image.fromarray(rgb)
-    if max_side is not None:
-        image.thumbnail((max_side, max_side), Image.Resampling.BOX)
-    return _saved(image, "JPEG", quality=quality)
+    image.thumbnail((max_side, max_side), Image.Resampling.BOX)
+    return _saved(image, "JPEG", quality=88)
 
 
 def _saved(image: Image.Image, kind: str, **options: int) -> bytes:

@@ -29,8 +29,13 @@ class _Known:
     title: str
     hint: str
     kind: LayerKind
-    arrays: tuple[str, ...]
+    of: tuple[str, ...] = ()
     main: bool = False
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        """Names of its arrays, by default its own."""
+        return self.of or (self.name,)
 
 
 _MODAL, _MEAN = ("modal_vx", "modal_vy"), ("mean_vx", "mean_vy")
@@ -41,75 +46,58 @@ _KNOWN = (
         "Direction",
         "Direction of the most frequent velocity, in which most vehicles go. No colour where they are stationary.",
         "direction",
-        _MODAL,
-        True,
+        of=_MODAL,
+        main=True,
     ),
-    _Known("speed", "Speed", "Speed of the most frequent velocity.", "speed", _MODAL, True),
-    _Known(
-        "speed_p85", "85th percentile speed", f"85 % of vehicles are slower. {_NEEDED}", "speed", ("speed_p85",), True
-    ),
-    _Known("count", "Vehicles", "A vehicle counts once at each pixel that it passes.", "count", ("count",), True),
+    _Known("speed", "Speed", "Speed of the most frequent velocity.", "speed", of=_MODAL, main=True),
+    _Known("speed_p85", "85th percentile speed", f"85 % of vehicles are slower. {_NEEDED}", "speed", main=True),
+    _Known("count", "Vehicles", "A vehicle counts once at each pixel that it passes.", "count", main=True),
     _Known(
         "direction_ci90_half_width",
         "Uncertainty of direction",
         "Small values mean that the layer Direction is accurate.",
         "angle",
-        ("direction_ci90_half_width",),
-        True,
+        main=True,
     ),
-    _Known("speed_se", "Uncertainty of speed", "Known from two vehicles on.", "speed", ("speed_se",), True),
-    _Known("speed_p50", "Median speed", "Half of the vehicles are slower.", "speed", ("speed_p50",)),
-    _Known("speed_p15", "15th percentile speed", f"15 % of vehicles are slower. {_NEEDED}", "speed", ("speed_p15",)),
-    _Known("direction_se", "Standard error of direction", "Known from two vehicles on.", "angle", ("direction_se",)),
+    _Known("speed_se", "Uncertainty of speed", "Known from two vehicles on.", "speed", main=True),
+    _Known("speed_p50", "Median speed", "Half of the vehicles are slower.", "speed"),
+    _Known("speed_p15", "15th percentile speed", f"15 % of vehicles are slower. {_NEEDED}", "speed"),
+    _Known("direction_se", "Standard error of direction", "Known from two vehicles on.", "angle"),
     _Known(
         "mean_direction",
         "Mean direction",
         "Direction of the mean velocity. Where vehicles go several ways, none may go this way.",
         "direction",
-        _MEAN,
+        of=_MEAN,
     ),
     _Known(
         "stationary_fraction",
         "Fraction stationary",
         "High at stop lines, in queues and where vehicles park.",
         "fraction",
-        ("stationary_fraction",),
     ),
-    _Known("occupancy", "Occupancy", "Long where they queue or park.", "time", ("occupancy_ms",)),
+    _Known("occupancy", "Occupancy", "Long where they queue or park.", "time", of=("occupancy_ms",)),
     _Known(
         "mode_fraction",
         "At the mode",
         "100 %: all vehicles have the direction and speed of the layers Direction and Speed.",
         "fraction",
-        ("mode_fraction",),
     ),
-    _Known(
-        "circular_variance",
-        "Variance of direction",
-        "0: all go one way; 1: no preferred direction.",
-        "plain",
-        ("circular_variance",),
-    ),
+    _Known("circular_variance", "Variance of direction", "0: all go one way; 1: no preferred direction.", "plain"),
     _Known(
         "entropy",
         "Entropy of velocity",
         "0: all vehicles have one velocity; the larger, the more their velocities differ.",
         "plain",
-        ("entropy",),
     ),
     _Known(
-        "speed_p50_ci90_lower",
-        "Median speed, lower bound",
-        "The median of more such traffic is rarely lower.",
-        "speed",
-        ("speed_p50_ci90_lower",),
+        "speed_p50_ci90_lower", "Median speed, lower bound", "The median of more such traffic is rarely lower.", "speed"
     ),
     _Known(
         "speed_p50_ci90_upper",
         "Median speed, upper bound",
         "The median of more such traffic is rarely higher.",
         "speed",
-        ("speed_p50_ci90_upper",),
     ),
 )
 _SPEED_SCALE = frozenset(
@@ -163,7 +151,7 @@ def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
     kind = _KINDS.get(str(attributes.get("units", "1")), "plain")
     change = "change" in name
     hint = "The later field minus the earlier one, where the difference is significant." if change else ""
-    return _Known(name, _capitalised(title), hint, "change" if change else kind, (name,), change)
+    return _Known(name, _capitalised(title), hint, "change" if change else kind, main=change)
 
 
 def _explanation(layer: _Known, attributes: Mapping[str, Mapping[str, Any]]) -> str:

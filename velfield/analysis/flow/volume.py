@@ -84,7 +84,6 @@ def lane_flow(
     lane: int,
     observed_s: FloatArray,
     *,
-    slice_s: float = 60.0,
     lengths_m: FloatArray | None = None,
 ) -> LaneFlow:
     """Traffic of one lane.
@@ -96,7 +95,7 @@ def lane_flow(
     lengths_m
         (tracks,) lengths of the vehicles; None: a car's.
     """
-    by_slice = flow_slices(traffic, lane, observed_s, slice_s=slice_s)
+    by_slice = flow_slices(traffic, lane, observed_s)
     passing = traffic.passings(lane, traffic.graph.lanes[lane].length_m / 2)
     # the first vehicle after a gap follows nobody that is known
     period = np.searchsorted(observed_s[:, 0], passing.time_s, side="right")

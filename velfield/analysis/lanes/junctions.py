@@ -19,7 +19,6 @@ _MARGIN_M, _HALF_LANE_M = 4.0, 2.0
 beside the centre line pass it, too."""
 _CROSSING_RAD = np.radians(25)
 """Lanes whose directions differ less do not cross: they merge or run beside each other."""
-_STEP_M = 1.5
 _MAX_RING_M = 220.0
 """Circumference of the largest roundabout."""
 

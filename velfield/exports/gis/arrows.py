@@ -13,6 +13,8 @@ from velfield.run.run import Run
 
 FILE_NAME = "arrows.geojson"
 
+_ARROW_S = 0.5
+"""An arrow is as long as the distance covered in this time."""
 _BARB_FRACTION, _BARB_ANGLE_RAD = 0.35, 2.6  # length of the barbs by the shaft's, and their angle to it
 
 
@@ -29,7 +31,6 @@ def arrows_geojson(
     *,
     spacing_px: int = 12,
     min_count: int = 1,
-    seconds: float = 0.5,
 ) -> dict[str, object]:
     """Arrows as a GeoJSON FeatureCollection (RFC 7946: longitude and latitude).
 
@@ -43,8 +44,6 @@ def arrows_geojson(
         One arrow a cell of this size, at its pixel with most vehicles, which is on the lane rather than beside it.
     min_count
         Fewer vehicles than this: no arrow.
-    seconds
-        An arrow is as long as the distance covered in this time.
 
     Raises
     ------
@@ -54,7 +53,7 @@ def arrows_geojson(
     rows, columns = _max_count_per_cell(np.asarray(count), np.asarray(modal_velocity_px_per_s), spacing_px, min_count)
     velocity = np.asarray(modal_velocity_px_per_s, np.float64)[rows, columns]
     tail = np.column_stack([columns, rows]).astype(np.float64)
-    strokes = _strokes(tail, velocity * seconds)
+    strokes = _strokes(tail, velocity * _ARROW_S)
     lonlat = georeference.to_lonlat(strokes.reshape(-1, 2)).reshape(strokes.shape)
     heading = georeference.heading_deg(tail, velocity)
     speed = np.linalg.norm(velocity, axis=1)
