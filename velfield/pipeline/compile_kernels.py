@@ -1,7 +1,7 @@
 """Have the kernels compiled: ``python -m velfield.pipeline.compile_kernels``.
 
-Two tiny jobs are run and discarded; what numba compiles on the way is cached beside the modules. The first job begins
-at what a run needs last, so that a first real run beside it, which begins at its frames, meets it half way.
+Tiny jobs are run and discarded; what numba compiles on the way is cached beside the modules. The first begins at what a
+run needs last, so that a first real run beside it, which begins at its frames, meets it half way.
 """
 
 import tempfile
@@ -22,12 +22,18 @@ from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.units import prepare_stage, stage_units
 
 _FLIGHT = SimulationConfig(frames=9, width=480, height=360, seed=3)
-_QUICK = {"detection.fine_tune_steps": 2, "registration.max_keypoints": 800, "gsd_m": 0.23}
+_QUICK = {
+    "lens.frames": 4,
+    "lens.max_edge_points": 5000,
+    "registration.max_keypoints": 800,
+    "detection.fine_tune_steps": 2,
+    "gsd_m": 0.23,
+}
 _SPEED_M_PER_S, _LENGTH_M, _EVERY_S, _VEHICLES = 10.0, 60.0, 2.0, 8
 
 
 def compile_kernels() -> None:
-    """Run both jobs: tracks to an analysis, then a simulated flight from its first frame to its maps."""
+    """Run tracks to an analysis, then a simulated flight to its maps: with nothing given, and with base and labels."""
     with tempfile.TemporaryDirectory(prefix="velfield-kernels-") as folder:
         _process_tracks(Path(folder))
         _process_flight(Path(folder))
@@ -58,13 +64,13 @@ def _crossing_streets() -> pd.DataFrame:
 def _process_flight(folder: Path) -> None:
     from velfield.synthetic.write import write_flight
 
-    flight = folder / "flight"
-    write_flight(flight, _FLIGHT)
-    config = resolve_config(preset="fast", overrides=_QUICK)
-    job = Job(root=str(folder / "run"), inputs=Inputs.from_simulated_flight(flight), config=config)
-    plan = make_plan(job)
-    write_flight_record(plan)
-    compute_stages(plan)
+    write_flight(folder / "flight", _FLIGHT)
+    given = Inputs.from_simulated_flight(folder / "flight")
+    for k, inputs in enumerate((Inputs(source=given.source, timestamps=given.timestamps), given)):
+        config = resolve_config(preset="fast", overrides=_QUICK)
+        plan = make_plan(Job(root=str(folder / f"run-{k}"), inputs=inputs, config=config))
+        write_flight_record(plan)
+        compute_stages(plan)
 
 
 if __name__ == "__main__":
