@@ -127,7 +127,7 @@ def _keep_memory() -> None:
 
 @contextmanager
 def kernels_beside() -> Iterator[None]:
-    """Compile the numba kernels, where none are cached, in another process by a tiny job while this one works.
+    """Compile the numba kernels, where none are cached, in another process by tiny jobs while this one works.
 
     A minute of a first run is waiting for the compiler on one processor, kernel after kernel; this way the later ones
     are cached when they are needed. Should it fail, nothing is lost.

@@ -22,9 +22,9 @@ from velfield.exports.export import export_run
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
 from velfield.pipeline.given_tracks.write import at_frames
-from velfield.pipeline.result import commit
-from velfield.pipeline.stage import resolve
-from velfield.pipeline.units import prepare_stage, stage_units
+from velfield.pipeline.graphs import tracks_graph
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import write_flight_record
 from velfield.pipeline.verify import verify_run
 from velfield.run.commits import read_commits
 from velfield.run.layout import RunLayout
@@ -82,14 +82,8 @@ def process(path: Path, out: Path, **settings: float | str) -> Run:
     """The stages of the run, one after the other, without Prefect."""
     config = FlightConfig.model_validate(settings)
     plan = plan_tracks(Job(root=str(out), inputs=Inputs(source=str(path)), config=config))
-    from velfield.pipeline.plan import write_flight_record
-
     write_flight_record(plan)
-    for stage in list_track_stages():
-        prepare_stage(plan, stage)
-        for unit in stage_units(plan, stage):
-            result = resolve(stage.from_tracks or stage.unit)(plan, *unit.part)
-            commit(plan, stage.name, unit.name, result, started=0.0)
+    compute_stages(plan, [stage.name for stage in list_track_stages()], graph=tracks_graph)
     return open_run(out)
 
 

@@ -12,14 +12,15 @@ import pandas as pd
 
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job
+from schemas.scale import CAR_LENGTH_M
 from schemas.simulation import SimulationConfig
 from velfield.pipeline.analysis.analyse import analyse_run
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
-from velfield.pipeline.graphs import compute_here, tracks_graph
+from velfield.pipeline.graphs import tracks_graph
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan, write_flight_record
-from velfield.pipeline.units import prepare_stage, stage_units
+from velfield.synthetic.write import write_flight
 
 _FLIGHT = SimulationConfig(frames=9, width=480, height=360, seed=3)
 _QUICK = {
@@ -44,10 +45,7 @@ def _process_tracks(folder: Path) -> None:
     _crossing_streets().to_csv(tracks, index=False)
     plan = plan_tracks(Job(root=str(run), inputs=Inputs(source=str(tracks)), config=FlightConfig()))
     write_flight_record(plan)
-    for stage in list_track_stages():
-        prepare_stage(plan, stage)
-        for unit in stage_units(plan, stage):
-            compute_here(tracks_graph(plan, stage, unit))
+    compute_stages(plan, [stage.name for stage in list_track_stages()], graph=tracks_graph)
     for _ in analyse_run(run):
         pass
 
@@ -56,18 +54,16 @@ def _crossing_streets() -> pd.DataFrame:
     """Vehicles that follow each other on two streets, which cross."""
     vehicle, along_m = np.mgrid[: 2 * _VEHICLES, 0 : _LENGTH_M : _SPEED_M_PER_S / 5].reshape(2, -1)
     east = vehicle % 2 == 0
-    x_m, y_m = np.where(east, [along_m, np.full_like(along_m, 30)], [np.full_like(along_m, 30), along_m])
+    x_m, y_m = np.where(east, along_m, _LENGTH_M / 2), np.where(east, _LENGTH_M / 2, along_m)
     time_s = vehicle // 2 * _EVERY_S + along_m / _SPEED_M_PER_S
-    return pd.DataFrame({"id": vehicle.astype(int), "time_s": time_s, "x_m": x_m, "y_m": y_m, "length_m": 4.5})
+    return pd.DataFrame({"id": vehicle.astype(int), "time_s": time_s, "x_m": x_m, "y_m": y_m, "length_m": CAR_LENGTH_M})
 
 
 def _process_flight(folder: Path) -> None:
-    from velfield.synthetic.write import write_flight
-
     write_flight(folder / "flight", _FLIGHT)
     given = Inputs.from_simulated_flight(folder / "flight")
+    config = resolve_config(preset="fast", overrides=_QUICK)
     for k, inputs in enumerate((Inputs(source=given.source, timestamps=given.timestamps), given)):
-        config = resolve_config(preset="fast", overrides=_QUICK)
         plan = make_plan(Job(root=str(folder / f"run-{k}"), inputs=inputs, config=config))
         write_flight_record(plan)
         compute_stages(plan)

@@ -447,7 +447,10 @@ def _take_step(
     weights: FloatArray,
     stiffness: tuple[float, float],
 ) -> _State | Failure:
-    """One Gauss-Newton step, halved until all control points of positive weight are mapped; else the state itself."""
+    """One Gauss-Newton step, halved until every control point of positive weight stays in the map's domain.
+
+    Returns the state itself if no halving suffices; a failure if the control points do not determine the map.
+    """
     (step,) = problem.steps(equations, state.theta, stiffness, leave_out=False)
     if not np.isfinite(step).all():
         return Failure(f"{len(weights)} control points do not determine the map: they lie on a line or in one place")
