@@ -24,6 +24,7 @@ test: export OMP_NUM_THREADS := 1
 test: page  ## every check: lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python page/build.py --check-types
 	$(BIN)/python -m velfield.pipeline.compile_kernels & kernels=$$!; $(BIN)/mypy && wait $$kernels || { kill $$kernels; exit 1; }
 	$(BIN)/python -m pytest $(IN_TWO)
 
@@ -63,8 +64,9 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(STAMP)
+types: page
 	$(BIN)/mypy
+	$(BIN)/python page/build.py --check-types
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

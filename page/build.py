@@ -75,13 +75,7 @@ def build() -> None:
     """
     if is_built():
         return
-    found = find_node()
-    if found is None:
-        raise SystemExit(f"the viewer page cannot be built: no node; `pip install '{NODE_WHEEL}'` brings one")
-    node, npm = found
-    _install_packages(node, npm)
-    types = [node, str(HERE / "node_modules" / "typescript" / "bin" / "tsc"), "--noEmit"]
-    subprocess.run(types, cwd=HERE, check=True, stdout=sys.stderr)
+    node = _node_with_packages()
     BUILT.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=HERE) as folder:
         out = Path(folder) / "page"
@@ -96,16 +90,27 @@ def build() -> None:
         out.replace(BUILT)
 
 
-def _install_packages(node: str, npm: str) -> None:
-    """``npm ci``, where what stands in ``node_modules`` is not what the lock says."""
+def check_types() -> int:
+    """Check the types of the page's sources, which the bundler only strips; the exit status."""
+    typescript = HERE / "node_modules" / "typescript" / "bin" / "tsc"
+    return subprocess.run([_node_with_packages(), str(typescript), "--noEmit"], cwd=HERE, check=False).returncode
+
+
+def _node_with_packages() -> str:
+    """Path of node; by ``npm ci``, where what stands in ``node_modules`` is not what the lock says."""
+    found = find_node()
+    if found is None:
+        raise SystemExit(f"the viewer page cannot be built: no node; `pip install '{NODE_WHEEL}'` brings one")
+    node, npm = found
     lock = (HERE / "package-lock.json").read_text()
     stamp = HERE / "node_modules" / ".installed-from"
     if stamp.exists() and stamp.read_text() == lock:
-        return
+        return node
     environment = {**os.environ, "PATH": f"{Path(node).parent}{os.pathsep}{os.environ.get('PATH', '')}"}
     command = [node, npm] if npm.endswith(".js") else [npm]
     subprocess.run([*command, "ci", "--loglevel=error"], cwd=HERE, check=True, env=environment, stdout=sys.stderr)
     stamp.write_text(lock)
+    return node
 
 
 def _bundle(node: str, out: Path) -> list[str]:
@@ -149,4 +154,6 @@ if __name__ == "__main__":
     if "--node-wheel" in sys.argv:
         print(NODE_WHEEL)
         sys.exit(0)
+    if "--check-types" in sys.argv:
+        sys.exit(check_types())
     build()

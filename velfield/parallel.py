@@ -28,16 +28,22 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T], *, at_most: int
 def for_each_behind(function: Callable[[T], object], items: Iterable[T]) -> None:
     """Apply ``function`` to every item, in order, on another thread, while the next are made: at most two wait."""
     with ThreadPoolExecutor(1) as pool:
-        behind = deque[Future[object]]()
         try:
-            for item in items:
-                behind.append(pool.submit(function, item))
-                if len(behind) > 2:
-                    behind.popleft().result()
-            for last in behind:
-                last.result()
+            for _ in map_ahead(pool, function, items, ahead=2):
+                pass
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def map_ahead(pool: ThreadPoolExecutor, function: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
+    """Results of ``function`` in the order of the items: ``ahead`` more are under way, or wait, while one is used."""
+    waiting = deque[Future[R]]()
+    for item in items:
+        waiting.append(pool.submit(function, item))
+        if len(waiting) > ahead:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
 
 
 def once(function: Callable[[], R]) -> Callable[[], R]:

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from schemas.simulation import SimulationConfig
 from velfield.errors import InputError
+from velfield.parallel import map_ahead
 from velfield.synthetic.clip import open_clip, simulate_telemetry
 from velfield.synthetic.flight import Flight, simulate
 from velfield.synthetic.truth import make_truth, save_truth
 
-_RENDERED_AHEAD = 8
+_RENDERED_AHEAD = 4
 WRITERS = 2
 """Threads that render and write; numba, OpenCV and NumPy release the interpreter lock."""
 
@@ -73,11 +74,10 @@ def _write_clip(out: Path, flight: Flight, _names: list[str], pool: ThreadPoolEx
     config = flight.config
     subtitles = simulate_telemetry(config, flight.camera, flight.base_shape)
     with open_clip(out, config, flight.times_s, subtitles) as clip:
-        for first in range(0, config.frames, _RENDERED_AHEAD):  # encoding is in order: only a few frames wait for it
-            part = range(first, min(first + _RENDERED_AHEAD, config.frames))
-            for frame, grey in zip(part, pool.map(flight.frame, part), strict=True):
-                clip.write(frame, grey)
-                yield
+        frames = range(config.frames)
+        for frame, grey in zip(frames, map_ahead(pool, flight.frame, frames, ahead=_RENDERED_AHEAD), strict=True):
+            clip.write(frame, grey)
+            yield
 
 
 def frame_name(index: int, config: SimulationConfig) -> str:
