@@ -31,6 +31,8 @@ from velfield.run.results import link_shared_outputs
 
 FIRST_FRAMES = 16
 """Frames of the first preview: three seconds."""
+_LENS_FRAMES, _MEDIAN_FRAMES = 3, 8
+"""Of them, those that give its lens and its base image: neighbours, which show little more than a few do."""
 Publishing = AbstractContextManager[object]
 """Entered to replace the field and the page of the run; raises where the run's own are being made."""
 
@@ -83,7 +85,8 @@ def _with_root(plan: Plan, **inputs: str | None) -> Plan:
 
 
 def _first_plan(plan: Plan) -> Plan:
-    """The plan of the first frames: without fine-tuning where a car's size is known, as it takes long."""
+    """The plan of the first frames: without what takes long and shows little, such as fine-tuning where a car's size is
+    known, and pairs of frames for the lens, which hardly move."""
     layout = plan.layout
     inputs: dict[str, str | None] = {}
     record = plan.inputs
@@ -93,6 +96,15 @@ def _first_plan(plan: Plan) -> Plan:
         inputs = {"detector": str(detector), "labels": None}
         record = InputsRecord.model_validate(record.model_dump() | {"detector": "shipped", "labels": None})
     first = replace(_with_root(plan, **inputs), indices=plan.indices[:FIRST_FRAMES], inputs=record)
+    lens = {"frames": min(plan.config.lens.frames, _LENS_FRAMES), "refine": "never"}
+    base = {"median_frames": min(plan.config.base.median_frames, _MEDIAN_FRAMES)}
+    config = first.config.model_copy(
+        update={
+            "lens": first.config.lens.model_copy(update=lens),
+            "base": first.config.base.model_copy(update=base),
+        }
+    )
+    first = replace(first, job=first.job.model_copy(update={"config": config}))
     return replace(first, keys=stage_keys(first.config, record)).with_lost_units(["all other frames"])
 
 
