@@ -26,7 +26,7 @@ from velfield.pipeline.stage import stages_before
 from velfield.pipeline.stages.frames import flag_frames
 from velfield.pipeline.stages.lens import calibrate_flight
 from velfield.pipeline.stages.registration import register_unit
-from velfield.run.stores import open_registration
+from velfield.run.stores import RegistrationStore
 from velfield.sources.images import read_grey_image
 from velfield.sources.source import probe
 from velfield.sources.video.corruption import BlockArtifactDetector
@@ -172,7 +172,7 @@ def test_a_zoom_in_mid_flight_is_reported(tmp_path: Path) -> None:
         frames.append(cv2.warpAffine(scene, matrix, (320, 240), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT))
     plan = planned(tmp_path, frames, "registration", "lens.calibrate=never")
     compute_stages(plan, ("registration",))
-    assert open_registration(plan.layout.registration).statuses()[5:] == ["ok", "ok"]
+    assert RegistrationStore(plan.layout.registration).statuses()[5:] == ["ok", "ok"]
     (line,) = register_unit(plan, range(7)).warnings
     assert "frames 5 to 6 show the ground at up to 1.4" in line
 
@@ -196,7 +196,7 @@ def test_a_turn_towards_the_horizon_in_mid_flight_is_reported(tmp_path: Path) ->
     """The last two of seven frames look 30 degrees away from the vertical, at the same place."""
     plan = planned(tmp_path, turned([0, 2, 0, 3, 1, 28, 30]), "registration", "lens.calibrate=never")
     compute_stages(plan, ("registration",))
-    assert open_registration(plan.layout.registration).statuses() == ["ok"] * 7
+    assert RegistrationStore(plan.layout.registration).statuses() == ["ok"] * 7
     (line,) = [line for line in register_unit(plan, range(7)).warnings if "degrees" in line]
     found = re.search(r"at up to (\d+) degrees from the base image's view", line)
     assert found is not None
@@ -207,7 +207,7 @@ def test_frames_of_a_turn_by_60_degrees_are_lost_with_the_reason(tmp_path: Path)
     """The sharpest frame is one of them; the base image is of those that most frames overlap with."""
     plan = planned(tmp_path, turned([0, 2, 0, 3, 1, 60, 60]), "registration", "lens.calibrate=never")
     compute_stages(plan, ("registration",))
-    statuses = open_registration(plan.layout.registration).statuses()
+    statuses = RegistrationStore(plan.layout.registration).statuses()
     assert statuses[:5] == ["ok"] * 5
     assert all(status.startswith("failed:") for status in statuses[5:])
 

@@ -11,7 +11,7 @@ from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.stage import stages_before
 from velfield.run.commits import read_commits
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_registration
+from velfield.run.stores import RegistrationStore
 from velfield.synthetic.write import write_flight
 
 STILL = CameraSimulation(drift_m=0, climb_share=0, turn_deg=0, tilt_deg=0, vibration_px=0)
@@ -33,7 +33,7 @@ def layout(tmp_path_factory: pytest.TempPathFactory) -> RunLayout:
 
 
 def test_every_frame_is_registered(layout: RunLayout) -> None:
-    assert open_registration(layout.registration).statuses() == ["ok"] * FRAMES
+    assert RegistrationStore(layout.registration).statuses() == ["ok"] * FRAMES
 
 
 def test_vehicles_are_detected_tracked_and_counted(layout: RunLayout) -> None:

@@ -21,7 +21,7 @@ from velfield.pipeline.compare import compare_runs
 from velfield.run.field_algebra import merge_fields, subtract_fields
 from velfield.run.field_reader import known_tiles
 from velfield.run.run import open_run
-from velfield.run.stores import open_field
+from velfield.run.stores import FieldStore
 
 COARSE = FieldConfig(bin_width_m_per_s=3.0)
 """Half of the usual bins, in less of the time; still coarser ones shift the percentiles that changes are found by."""
@@ -29,7 +29,7 @@ COARSE = FieldConfig(bin_width_m_per_s=3.0)
 
 def everything(root: Path) -> dict[str, np.ndarray]:
     """The histogram and all layers."""
-    store = open_field(root / "field.zarr")
+    store = FieldStore(root / "field.zarr")
     tiles = known_tiles(store.layer("count"), store.tile)
     histograms = {f"{name} {tile}": store.read_tile(*tile, name) for tile in tiles for name in store.histogram_names()}
     return histograms | {name: store.layer(name) for name in store.layer_names()}

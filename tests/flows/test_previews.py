@@ -18,7 +18,7 @@ from velfield.pipeline.plan import make_plan
 from velfield.pipeline.preview import make_first_preview, publish_first_preview
 from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
-from velfield.run.stores import open_field
+from velfield.run.stores import FieldStore
 
 
 class Recording(Console):
@@ -38,7 +38,7 @@ class Recording(Console):
     def event(self, kind: str, text: str, **values: Any) -> None:
         if kind == "preview":
             (title,) = re.findall(r"<title>(.*?)</title>", (self.root / "index.html").read_text())
-            vehicles = int(open_field(self.root / "field.zarr").layer("count").sum())
+            vehicles = int(FieldStore(self.root / "field.zarr").layer("count").sum())
             assert (self.root / "maps/direction.png").stat().st_size > 1000
             with self._more:
                 self.seen.append((values["frames"], title, vehicles))
@@ -86,7 +86,7 @@ def test_previews_come_and_grow_and_leave_no_trace(
     for found, title, vehicles in console.seen:
         assert f"{found} of {FRAMES} frames" in title or f"the first {found} of" in title
         assert vehicles > 0
-    assert console.seen[-1][2] < open_field(root / "field.zarr").layer("count").sum()
+    assert console.seen[-1][2] < FieldStore(root / "field.zarr").layer("count").sum()
     assert not RunLayout(root).preview.exists()
     assert digests(root) == digests(whole[0])
 

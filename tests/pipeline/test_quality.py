@@ -22,7 +22,7 @@ from velfield.pipeline.stage import stages_before
 from velfield.registration.mesh import reach
 from velfield.run.commits import read_commit
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 from velfield.sources.quality import UNUSABLE, FrameFlag
 from velfield.sources.source import iter_frames, probe
 
@@ -98,7 +98,7 @@ def test_flags_are_the_same_however_the_flight_is_cut(damaged: Path, tmp_path: P
     for unit in (3, 18):
         root = tmp_path / f"unit-{unit}"
         compute_stages(make_plan(job(damaged, root, f"work.unit_frames={unit}")), stages_before("lens"))
-        assert open_frames(RunLayout(root).frames).column("flags").tolist() == EXPECTED
+        assert FrameStore(RunLayout(root).frames).column("flags").tolist() == EXPECTED
 
 
 def test_no_frame_of_a_good_flight_is_flagged(whole: tuple[Path, RunSummary]) -> None:
@@ -142,7 +142,7 @@ def clip(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Clip:
 
 def test_frames_of_a_damaged_bitstream_are_in_no_tracklet(clip: Clip) -> None:
     """From the first error to the next key frame; the frames before have theirs."""
-    read = open_frames(clip.plan.layout.frames)
+    read = FrameStore(clip.plan.layout.frames)
     flags = read.column("flags")
     suspect = set(np.flatnonzero(flags & int(UNUSABLE)).tolist())
     assert 1 <= len(suspect) <= 12
@@ -198,7 +198,7 @@ def test_a_unit_of_frames_that_are_all_unreadable_is_lost_frames_and_the_rest_go
         path.write_bytes(b"not a picture")
     summary = process(job(tmp_path / "flight", tmp_path / "run"))
     assert not summary.complete  # `velfield run` ends with status 3
-    store = open_frames(RunLayout(str(tmp_path / "run")).frames)
+    store = FrameStore(RunLayout(str(tmp_path / "run")).frames)
     unreadable = (store.column("flags") & int(FrameFlag.UNREADABLE)) > 0
     assert np.flatnonzero(unreadable).tolist() == list(range(8, 16))
     assert sum("unreadable" in line for line in summary.frames_lost) == 8

@@ -34,7 +34,7 @@ from velfield.run.frame_transforms import (
     read_working,
 )
 from velfield.run.layout import RunLayout
-from velfield.run.stores import create_frames, create_registration, open_registration
+from velfield.run.stores import RegistrationStore, create_frames, create_registration
 
 WIDTH, HEIGHT, CONFIG = 320, 240, FlightConfig()
 NORMALISATION = np.array([160.0, 120.0, 1 / 200])
@@ -61,7 +61,7 @@ def layout(tmp_path: Path) -> RunLayout:
     vectors = np.full((3, length), np.nan)
     for frame, transform in ((0, similarity(1.1, 0.1, (5, 7))), (2, similarity(0.9, -0.2, (0, 3)))):
         vectors[frame] = frame_transform(transform).to_vector(CONFIG.registration)
-    open_registration(layout.registration, "r+").write(0, vectors, ["ok", "failed:blurred", "ok"], {})
+    RegistrationStore(layout.registration, "r+").write(0, vectors, ["ok", "failed:blurred", "ok"], {})
     layout.base.mkdir()
     return layout
 
@@ -124,7 +124,7 @@ def test_the_map_to_a_given_image_has_a_mesh_and_a_standard_deviation_that_both_
     to_given = MeshedTransform(similarity(2.0, 0.0, (0, 0)), mesh, 100)
     record = base_mesh_to_record(BaseMesh(to_given, 0.2, 99, Support(sd_px, WIDTH, HEIGHT)))
     layout.own_to_base.write_text(record.model_dump_json())
-    store = open_registration(layout.registration, "r+")
+    store = RegistrationStore(layout.registration, "r+")
     own_sd = np.full((3, *CELLS), 0.2, np.float32)
     store.write(0, store.column("vector", 0, 3), store.statuses(), {"position_sd_px": own_sd})
     frames = FrameTransforms.open(layout, CONFIG)

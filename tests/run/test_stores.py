@@ -11,14 +11,13 @@ from velfield.errors import InputError, StoreError
 from velfield.run.shards import decode_tile, encode_tile
 from velfield.run.stores import (
     HISTOGRAM,
+    FieldStore,
     FrameStore,
+    RegistrationStore,
     create_field,
     create_frames,
     create_registration,
     is_cut_as,
-    open_field,
-    open_frames,
-    open_registration,
     store_key,
 )
 
@@ -26,7 +25,7 @@ from velfield.run.stores import (
 def frame_store(path: Path, frames: np.ndarray) -> FrameStore:
     count, height, width = frames.shape
     create_frames(path, key="k", count=count, height=height, width=width, unit_frames=2, source={})
-    store = open_frames(path, "r+")
+    store = FrameStore(path, "r+")
     for k, frame in enumerate(frames):
         store.write(k, frame)
     return store
@@ -40,7 +39,7 @@ def test_frames_come_back(tmp_path: Path) -> None:
     frames = noise(1, 5, 24, 32)
     store = frame_store(tmp_path / "f.zarr", frames)
     store.write_columns(2, {"time_s": np.array([1.5, 1.75]), "decoding_flags": np.array([4, 1], np.uint16)})
-    store = open_frames(tmp_path / "f.zarr")
+    store = FrameStore(tmp_path / "f.zarr")
     assert store.count == 5
     assert store.shape == (24, 32)
     assert all(np.array_equal(store.read(k), frames[k]) for k in range(5))
@@ -53,7 +52,7 @@ def test_flags_are_one_chunk_even_where_all_are_the_fill_value(tmp_path: Path) -
     store = frame_store(tmp_path / "f.zarr", noise(1, 5, 24, 32))
     for flags in (np.full(5, 2), np.array([0, 16, 0, 0, 32])):
         assert store.write_flags(flags).exists()
-        np.testing.assert_array_equal(open_frames(tmp_path / "f.zarr").column("flags"), flags)
+        np.testing.assert_array_equal(FrameStore(tmp_path / "f.zarr").column("flags"), flags)
 
 
 @pytest.mark.parametrize("bit", range(0, 4000, 97))
@@ -77,7 +76,7 @@ def test_a_chunk_that_is_gone_is_not_read_as_black(tmp_path: Path) -> None:
 
 def test_a_store_that_is_not_there_says_what_to_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="run `velfield run`"):
-        open_frames(tmp_path / "none.zarr")
+        FrameStore(tmp_path / "none.zarr")
     assert store_key(tmp_path / "none.zarr") is None
 
 
@@ -86,8 +85,8 @@ def test_registration_comes_back(tmp_path: Path) -> None:
     create_registration(path, key="k", count=5, vector_length=3, unit_frames=2)
     statuses = ["ok", "failed:12 control points, 40 needed"]
     columns = {"heldout_px": np.array([0.25, np.nan], np.float32), "n_inliers": np.array([900, 12], np.int32)}
-    open_registration(path, "r+").write(2, np.arange(6.0).reshape(2, 3), statuses, columns)
-    store = open_registration(path)
+    RegistrationStore(path, "r+").write(2, np.arange(6.0).reshape(2, 3), statuses, columns)
+    store = RegistrationStore(path)
     assert store.statuses() == ["", "", *statuses, ""]
     np.testing.assert_array_equal(store.column("vector")[3], [3, 4, 5])
     assert np.isnan(store.column("vector")[0]).all()
@@ -110,7 +109,7 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
         layers={"count": ("int32", {"units": "1"}), "modal_vx": ("float32", {"units": "px s-1"})},
     )
     tile = np.arange(4 * 6 * 9, dtype=np.int32).reshape(4, 6, 3, 3)
-    store = open_field(path, "r+")
+    store = FieldStore(path, "r+")
     store.write_tile(2, 3, tile, np.ones((4, 6), np.int32))
     np.testing.assert_array_equal(store.read_tile(2, 3), tile)
     assert store.has_tile(2, 3)
@@ -130,7 +129,7 @@ def test_layers_are_read_by_zarr_as_written(tmp_path: Path, group: tuple[int, in
     path = tmp_path / "field.zarr"
     layers = {"count": ("int32", {"units": "1"}), "modal_vx": ("float32", {"units": "px s-1"})}
     create_empty_field(path, side=20, tile=8, bins=3, layers=layers)
-    store, (y, x) = open_field(path, "r+"), (16 * group[0], 16 * group[1])
+    store, (y, x) = FieldStore(path, "r+"), (16 * group[0], 16 * group[1])
     window = np.s_[y : y + 16, x : x + 16]
     for name, fill in (("count", 0), ("modal_vx", np.nan)):
         written = zarr.open_array(path / name, mode="r")
@@ -173,7 +172,7 @@ def test_a_flipped_bit_of_a_tile_changes_no_value_in_silence(tmp_path: Path) -> 
     np.testing.assert_array_equal(decode_tile(shard, tile.shape, 16), tile)
     path = tmp_path / "field.zarr"
     create_empty_field(path, side=16, tile=16, bins=5)
-    store = open_field(path, "r+")
+    store = FieldStore(path, "r+")
     store.write_tile(0, 0, tile, count)
     np.testing.assert_array_equal(zarr.open_array(path / HISTOGRAM, mode="r")[:], tile)  # by zarr's own codec
     file = path / HISTOGRAM / "c" / "0" / "0" / "0" / "0"
@@ -201,7 +200,7 @@ def test_a_column_that_never_was_is_not_called_damaged(tmp_path: Path) -> None:
         frames.column("bogus")
     create_registration(tmp_path / "r.zarr", key="k", count=2, vector_length=3, unit_frames=2)
     with pytest.raises(InputError, match=r"found no column 'bogus'; it has .*heldout_px"):
-        open_registration(tmp_path / "r.zarr").column("bogus")
+        RegistrationStore(tmp_path / "r.zarr").column("bogus")
 
 
 def test_a_store_of_units_of_another_length_is_not_taken_for_one_of_ours(tmp_path: Path) -> None:

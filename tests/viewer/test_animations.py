@@ -29,7 +29,7 @@ from velfield.field.segments import SEGMENT_DTYPE, stationary_speed_px_per_s
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
-from velfield.run.stores import open_field
+from velfield.run.stores import FieldStore
 from velfield.viewer.flow import DRAWS, _draw_tile
 from velfield.viewer.replay import CHUNK_S, chunk_count, position_step, replay_chunks, vehicle_paths
 
@@ -169,7 +169,7 @@ def test_the_flow_holds_the_distribution_of_the_field(run: Run, record: ViewReco
     moving = run.field.modal_speed_px_per_s() > stationary_speed_px_per_s(run.record.config.field, run.grid.gsd_m)
     y, x = np.nonzero(moving)
     assert set(((y // side) * -(-width // side) + x // side).tolist()) <= set(cells.tolist())
-    differences, store = [], open_field(run.layout.field)
+    differences, store = [], FieldStore(run.layout.field)
     for k in range(0, n, max(1, n // 40)):
         row, column = divmod(int(cells[k]), -(-width // side))
         y0, x0 = row * side, column * side

@@ -17,7 +17,7 @@ from velfield.analysis import coverage
 from velfield.report.figures import colour_scale_max, round_up
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
-from velfield.run.stores import open_field
+from velfield.run.stores import FieldStore
 
 pytestmark = NEEDS_PAGE
 
@@ -233,7 +233,7 @@ def test_the_labels_of_a_histogram_do_not_touch(page: Page, address: str, run: R
 def test_the_page_colours_speeds_as_the_figure_does_and_notes_what_is_cut_off(
     page: Page, address: str, whole: tuple[Path, RunSummary]
 ) -> None:
-    store = open_field(RunLayout(whole[0]).field)
+    store = FieldStore(RunLayout(whole[0]).field)
     modal = np.hypot(store.layer("modal_vx"), store.layer("modal_vy")).astype(np.float64) * 0.23 * 3.6
     reach = colour_scale_max(modal)
     assert reach is not None

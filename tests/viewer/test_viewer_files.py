@@ -17,7 +17,7 @@ from velfield.exports.export import export_run
 from velfield.pipeline.compare import compare_runs
 from velfield.pipeline.stages import report as report_step
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_field
+from velfield.run.stores import FieldStore
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import OVERLAP_PX, TILE_PX, pyramid_levels, pyramid_tiles
 
@@ -73,7 +73,7 @@ def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None
     assert record.gsd_m == 0.23
     assert run.record.config.field.lane_width_m / 4 / 0.23 == pytest.approx(record.segments.band_radius_px)
     assert record.segments.tracks == len(np.unique(run.segments()["track"]))
-    store = open_field(layout.field)
+    store = FieldStore(layout.field)
     assert all(layer.description for layer in record.layers)
     for layer in record.layers:
         if len(layer.arrays) == 1:  # in the store's own words

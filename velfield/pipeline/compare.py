@@ -18,7 +18,7 @@ from velfield.run.commits import write_atomically
 from velfield.run.field_algebra import check_same_grid
 from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.run import Run, open_run
-from velfield.run.stores import open_field
+from velfield.run.stores import FieldStore
 from velfield.viewer.record import write_change_layers
 
 
@@ -40,7 +40,7 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
     """
     runs = open_run(before), open_run(after)
     check_same_grid(before, after)
-    stores = [open_field(run.layout.field) for run in runs]
+    stores = [FieldStore(run.layout.field) for run in runs]
     seconds = [float(store.attributes["observed_s"]) for store in stores]
     changes = compare_fields(
         stores[0].layer,

@@ -7,7 +7,7 @@ from schemas.summary import RunSummary, StageSummary
 from velfield.errors import count_text
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import STAGE
-from velfield.run.stores import open_frames, open_registration
+from velfield.run.stores import FrameStore, RegistrationStore
 from velfield.sources.frames import FootageLoss
 
 _MEANS = frozenset({"heldout_px", "residual_px", "searched"})
@@ -63,8 +63,8 @@ def summarise_run(plan: Plan, stages: Sequence[StageSummary]) -> RunSummary:
 
 def lost_frames(plan: Plan) -> tuple[str, ...]:
     """Frames that are not registered, with the reason, one line each."""
-    times_s = open_frames(plan.layout.frames).column("time_s")
-    statuses = open_registration(plan.layout.registration).statuses()
+    times_s = FrameStore(plan.layout.frames).column("time_s")
+    statuses = RegistrationStore(plan.layout.registration).statuses()
     return tuple(
         f"frame {frame} ({times_s[frame]:.3f} s): {status or 'not processed'}"
         for frame, status in enumerate(statuses)

@@ -15,7 +15,7 @@ from velfield.run.field_writer import GroupWriter, create_field_store, tile_grou
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import read_grid, read_working
 from velfield.run.layout import RunLayout
-from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field, store_key
+from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, store_key
 
 Combine = Callable[[Sequence[FieldTile | None]], FieldTile | None]
 
@@ -74,7 +74,7 @@ def check_same_grid(first: Path, other: Path) -> None:
     InputError
         They differ: in what, and what to do.
     """
-    a, b = (open_field(RunLayout(root).field) for root in (first, other))
+    a, b = (FieldStore(RunLayout(root).field) for root in (first, other))
     if a.shape != b.shape or a.tile != b.tile:
         raise InputError(_mismatch(first, other, "size", f"{a.shape[::-1]} px", f"{b.shape[::-1]} px"))
     for name in (*_SAME, *_SAME_GEOREFERENCE):
@@ -108,7 +108,7 @@ def _base_digest(root: Path) -> str:
 def _open_compatible(roots: Sequence[Path]) -> list[FieldStore]:
     for other in roots[1:]:
         check_same_grid(roots[0], other)
-    return [open_field(RunLayout(root).field) for root in roots]
+    return [FieldStore(RunLayout(root).field) for root in roots]
 
 
 def _write(
@@ -140,7 +140,7 @@ def _write(
         time_weighted=all(HISTOGRAM_TIME_WEIGHTED in store.histogram_names() for store in stores),
         more=made_from,
     )
-    target = open_field(layout.field, "r+")
+    target = FieldStore(layout.field, "r+")
     kinds = [[tile_reader(store, name) for store in stores] for name in target.histogram_names()]
     bins = VelocityBins.from_config(config, grid.gsd_m)
     files = set[Path]()

@@ -14,7 +14,7 @@ from velfield.field.view import TileSource, VelocityField
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import read_grid
 from velfield.run.layout import RunLayout
-from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field
+from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,14 @@ def open_velocity_field(layout: RunLayout, *, time_weighted: bool = False) -> Ve
         The field was not built yet, or not with that weight.
     """
     config = read_flight_record(layout.root).config.field
-    return field_from_store(open_field(layout.field), config, read_grid(layout), time_weighted=time_weighted)
+    return field_from_store(FieldStore(layout.field), config, read_grid(layout), time_weighted=time_weighted)
 
 
 def source_runs(layout: RunLayout) -> tuple[str, ...]:
     """The runs of whose fields this folder's was made by `velfield.run.field_algebra`; empty of a run of its own."""
     if not layout.field.exists():
         return ()
-    about = open_field(layout.field).attributes
+    about = FieldStore(layout.field).attributes
     return (
         *about.get("merged_from", ()),
         *(about[name] for name in ("subtracted_from", "subtracted") if name in about),
@@ -57,7 +57,7 @@ def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
     grid = read_grid(layout)
     fields = []
     for path in sorted(layout.intervals.glob("*.zarr")):
-        store = open_field(path)
+        store = FieldStore(path)
         about = store.attributes
         ends = float(about.get("start_s", -inf)), float(about.get("stop_s", inf))
         field = field_from_store(store, config, grid)

@@ -40,7 +40,7 @@ from velfield.registration.transforms import (
     as_points,
 )
 from velfield.run.layout import RunLayout, local_copy
-from velfield.run.stores import RegistrationStore, open_frames, open_registration
+from velfield.run.stores import FrameStore, RegistrationStore
 
 _MAX_MAPS = 64
 R = TypeVar("R", bound=Model)
@@ -262,13 +262,13 @@ class FrameTransforms:
     @classmethod
     def open(cls, layout: RunLayout, config: FlightConfig) -> "FrameTransforms":
         """The transforms of a run folder."""
-        height, width = open_frames(layout.frames).shape
+        height, width = FrameStore(layout.frames).shape
         return cls(
             width=width,
             height=height,
             lens=read_lens(layout),
             base_maps=_base_maps(layout),
-            store=open_registration(layout.registration),
+            store=RegistrationStore(layout.registration),
             config=config.registration,
         )
 

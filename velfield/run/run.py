@@ -32,7 +32,7 @@ from velfield.run.field_reader import IntervalField, open_field_intervals, open_
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_georeference, read_grid
 from velfield.run.layout import RunLayout, to_path
-from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
+from velfield.run.stores import FieldStore, FrameStore, RegistrationStore
 from velfield.run.tables import read_tables
 
 _EACH_ONCE = {"shared_segment_weight": 1}
@@ -88,13 +88,13 @@ class Run:
     def frames(self) -> FrameStore:
         """The frames: ``run.frames.read(frame)`` is (h, w) uint8."""
         self.require_frames()
-        return open_frames(self.layout.frames)
+        return FrameStore(self.layout.frames)
 
     @cached_property
     def registration(self) -> RegistrationStore:
         """Per-frame results of registration."""
         self.require_frames()
-        return open_registration(self.layout.registration)
+        return RegistrationStore(self.layout.registration)
 
     @cached_property
     def grid(self) -> GridRecord:
@@ -305,7 +305,7 @@ class Run:
         """Traffic answers, carriageways and bottlenecks: ``run.analysis.traffic.signals``."""
 
         def layer(name: str) -> NDArray[np.generic]:
-            return open_field(self.layout.field).layer(name)
+            return FieldStore(self.layout.field).layer(name)
 
         position_sd_m = max(
             (c.counts.get(POSITION_SD_M, 0.0) for c in read_commits(self.layout, "tracks")), default=0.0

@@ -9,10 +9,9 @@ Three rules, each after a fault seen in zarr or in its use:
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import zarr
@@ -28,8 +27,6 @@ from velfield.run.shards import block_side, decode_tile, encode_chunk, encode_ti
 
 _ZSTANDARD = ZstdCodec(level=1, checksum=True)
 _STATUS_BYTES = 160
-_FORMAT_KEY = "format_version"
-"""Attribute of a store that names its format."""
 HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 GROUP_TILES = 8
@@ -38,17 +35,9 @@ FIELD_BLOCK = 2
 """Side of a unit of work in groups: each reads the tables of tracks once, and costs a task of its own."""
 
 
-def _create(
-    group: zarr.Group,
-    name: str,
-    shape: Sequence[int],
-    chunks: Sequence[int],
-    dtype: str,
-    *,
-    codec: ZstdCodec | Crc32cCodec = _ZSTANDARD,
-    **kw: Any,
-) -> zarr.Array[Any]:
-    return group.create_array(name, shape=tuple(shape), chunks=tuple(chunks), dtype=dtype, compressors=codec, **kw)
+def _create(group: zarr.Group, name: str, shape: Sequence[int], chunks: Sequence[int], dtype: str, **kw: Any) -> Any:
+    about = {"compressors": _ZSTANDARD, **kw}
+    return group.create_array(name, shape=tuple(shape), chunks=tuple(chunks), dtype=dtype, **about)
 
 
 def fill_value(dtype: str) -> float:
@@ -63,77 +52,97 @@ def _location(path: Path) -> dict[str, Any]:
     return {"store": path}
 
 
-class _Group:
-    """A group, opened, whose arrays are opened once: on S3 each opening is a request or two."""
+def _new_group(path: Path, attributes: Mapping[str, Any]) -> zarr.Group:
+    about = {"format_version": FORMAT_VERSION, **attributes}
+    return zarr.create_group(**_location(path), overwrite=True, attributes=about)
 
-    def __init__(self, group: zarr.Group) -> None:
-        self._group = group
+
+def _open_group(path: Path, mode: Any = "r") -> zarr.Group:
+    return zarr.open_group(**_location(path), mode=mode, zarr_format=3, use_consolidated=False)
+
+
+class _Store:
+    """A store, opened, whose arrays are opened once: on S3 each opening is a request or two.
+
+    Raises
+    ------
+    InputError
+        There is none at the path.
+    """
+
+    def __init__(self, path: Path, mode: str = "r") -> None:
+        self.path = path
         self._arrays: dict[str, zarr.Array[Any]] = {}
-
-    @property
-    def attrs(self) -> Mapping[str, Any]:
-        return dict(self._group.attrs)
+        try:
+            self._group = _open_group(path, mode)
+        except FileNotFoundError:
+            raise InputError(f"{path} does not exist: run `velfield run` on this folder first") from None
 
     def __getitem__(self, name: str) -> zarr.Array[Any]:
         if name not in self._arrays:
             self._arrays[name] = cast("zarr.Array[Any]", self._group[name])
         return self._arrays[name]
 
-    @cached_property
-    def by_axes(self) -> dict[int, list[str]]:
-        """Names of the arrays by their number of axes, sorted."""
-        self._arrays |= dict(self._group.arrays())
-        names: dict[int, list[str]] = {}
-        for name in sorted(self._arrays):
-            names.setdefault(self._arrays[name].ndim, []).append(name)
-        return names
+    def _read(self, name: str, selection: Any) -> NDArray[Any]:
+        try:
+            return np.asarray(self[name][selection])
+        except Exception as error:
+            raise StoreError(
+                f"{self.path / name}: a chunk is damaged ({error}); `velfield verify {self.path.parent}` finds which"
+            ) from error
+
+    def _file(self, name: str, *place: int) -> Path:
+        """File of a chunk, or of a shard."""
+        return (self.path / name / "c").joinpath(*map(str, place))
+
+    def _files(self, chunks: Iterable[Path]) -> list[Path]:
+        """The metadata files of the store and its arrays, and of its chunks those that exist: zarr writes none that
+        hold only the fill value."""
+        metadata = [self.path / "zarr.json", *sorted(self.path.glob("*/zarr.json"))]
+        return [*metadata, *(path for path in chunks if path.exists())]
 
 
-def _open(path: Path, mode: str) -> _Group:
-    try:
-        return _Group(zarr.open_group(**_location(path), mode=cast(Any, mode), zarr_format=3, use_consolidated=False))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist: run `velfield run` on this folder first") from None
+class _ByFrame(_Store):
+    """A store of frames; ``_main`` is the array of which each frame has a part."""
+
+    _main: ClassVar[str]
+
+    @property
+    def count(self) -> int:
+        return int(self[self._main].shape[0])
+
+    def check_frame(self, frame: int) -> int:
+        """The frame itself; InputError where there is none of this number, whose chunk would look missing."""
+        if not 0 <= frame < self.count:
+            raise InputError(f"{self.path}: frame {frame} is not in the run: its frames go from 0 to {self.count - 1}")
+        return frame
+
+    def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Write a whole unit of columns from frame ``start`` on."""
+        for name, values in columns.items():
+            self[name][start : start + len(values)] = values
+
+    def _column(self, name: str, known: Iterable[str], rows: slice) -> NDArray[Any]:
+        """Rows of a column; an unknown name, which would look like a damaged column, is refused."""
+        if name not in known:
+            raise InputError(f"{self.path}: found no column {name!r}; it has {', '.join(known)}")
+        return self._read(name, rows)
 
 
-def _read(path: Path, group: _Group, name: str, selection: Any) -> NDArray[Any]:
-    try:
-        return np.asarray(group[name][selection])
-    except Exception as error:
-        raise StoreError(
-            f"{path / name}: a chunk is damaged ({error}); `velfield verify {path.parent}` finds which"
-        ) from error
-
-
-def _check_column(path: Path, name: str, known: Iterable[str]) -> None:
-    """Refuse an unknown name, which would look like a damaged column."""
-    if name not in known:
-        raise InputError(f"{path}: found no column {name!r}; it has {', '.join(known)}")
-
-
-def _check_frame(path: Path, frame: int, count: int) -> None:
-    """Refuse an unknown frame, whose chunk would look missing or damaged."""
-    if not 0 <= frame < count:
-        raise InputError(f"{path}: frame {frame} is not in the run: its frames go from 0 to {count - 1}")
-
-
-def _metadata(path: Path) -> list[Path]:
-    """The metadata files of a store and its arrays."""
-    return [path / "zarr.json", *sorted(path.glob("*/zarr.json"))]
-
-
-def _existing(paths: Iterable[Path]) -> list[Path]:
-    """Chunks that exist: zarr writes none that hold only the fill value."""
-    return [path for path in paths if path.exists()]
-
-
-# ------------------------------------------------------------------------------------------------------------- frames
+def _create_columns(
+    group: zarr.Group, count: int, unit_frames: int, columns: Mapping[str, tuple[str, float, tuple[int, ...]]]
+) -> None:
+    """Create columns of frames, of a type, a fill value and a shape each, whose chunks are units of work."""
+    chunk = min(unit_frames, max(count, 1))
+    for name, (dtype, fill, shape) in columns.items():
+        axes = None if len(shape) == 1 else ("frame", "row", "column")[: 1 + len(shape)]
+        _create(group, name, (count, *shape), (chunk, *shape), dtype, fill_value=fill, dimension_names=axes)
 
 
 def store_key(path: Path) -> str | None:
     """Content key that a store was created under; None where it does not exist or is incomplete."""
     try:
-        return str(zarr.open_group(**_location(path), mode="r", zarr_format=3, use_consolidated=False).attrs["key"])
+        return str(_open_group(path).attrs["key"])
     except (FileNotFoundError, KeyError, ValueError):
         return None
 
@@ -145,10 +154,12 @@ def is_cut_as(path: Path, key: str, unit_frames: int) -> bool:
     """
     if store_key(path) != key:
         return False
-    group = zarr.open_group(**_location(path), mode="r", zarr_format=3, use_consolidated=False)
+    group = _open_group(path)
     column: Any = group["vector" if "vector" in group else "time_s"]
     return bool(column.chunks[0] == min(unit_frames, max(column.shape[0], 1)))
 
+
+# ------------------------------------------------------------------------------------------------------------- frames
 
 FRAME_COLUMNS: dict[str, tuple[str, float]] = {
     "time_s": ("float64", np.nan),
@@ -167,36 +178,25 @@ def create_frames(
     path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
 ) -> None:
     """Create ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
-    group = zarr.create_group(
-        **_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, "source": dict(source)}
-    )
-    chunk = min(unit_frames, max(count, 1))
+    group = _new_group(path, {"source": dict(source)})
     # Zstandard takes off a tenth of a frame, for 13 ms a frame of 5 Mpx to write and 4 ms to read.
     raw, axes = (count, height, width), ("frame", "y", "x")
-    _create(group, "raw", raw, (1, height, width), "uint8", codec=Crc32cCodec(), dimension_names=axes)
-    for name, (dtype, fill) in FRAME_COLUMNS.items():
-        _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
-    shape, chunks = (count, *THUMBNAIL_SHAPE), (chunk, *THUMBNAIL_SHAPE)
-    _create(group, "thumbnail", shape, chunks, "float32", fill_value=0, dimension_names=("frame", "row", "column"))
-    _create(group, FLAGS, (count,), (max(count, 1),), "uint16", fill_value=2, dimension_names=("frame",))
+    _create(group, "raw", raw, (1, height, width), "uint8", compressors=Crc32cCodec(), dimension_names=axes)
+    columns = {name: (*column, ()) for name, column in FRAME_COLUMNS.items()}
+    _create_columns(group, count, unit_frames, {**columns, "thumbnail": ("float32", 0, THUMBNAIL_SHAPE)})
+    _create_columns(group, count, max(count, 1), {FLAGS: ("uint16", 2, ())})
     group.attrs["key"] = key  # last: a store without it is incomplete
 
 
-@dataclass(frozen=True)
-class FrameStore:
+class FrameStore(_ByFrame):
     """``frames.zarr``, opened."""
 
-    path: Path
-    group: _Group
-
-    @property
-    def count(self) -> int:
-        return int(self.group["raw"].shape[0])
+    _main = "raw"
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width) of a frame, px."""
-        _, height, width = self.group["raw"].shape
+        _, height, width = self["raw"].shape
         return int(height), int(width)
 
     def read(self, frame: int) -> GreyImage:
@@ -209,49 +209,37 @@ class FrameStore:
         StoreError
             The chunk is damaged or gone.
         """
-        _check_frame(self.path, frame, self.count)
-        if not (self.path / "raw" / "c" / str(frame) / "0" / "0").exists():
+        self.check_frame(frame)
+        if not self._file("raw", frame, 0, 0).exists():
             raise StoreError(f"{self.path}: the chunk of frame {frame} is missing; `velfield run` writes it again")
         try:
-            return np.asarray(self.group["raw"][frame], dtype=np.uint8)
+            return np.asarray(self["raw"][frame], dtype=np.uint8)
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of frame {frame} is damaged ({error})") from error
 
     def write(self, frame: int, grey: GreyImage) -> None:
         """Write one frame: one chunk, also of a black frame, which else would look missing."""
-        self.group["raw"].with_config({"write_empty_chunks": True})[frame] = grey
+        self["raw"].with_config({"write_empty_chunks": True})[frame] = grey
 
     def column(self, name: str) -> NDArray[Any]:
         """One column: ``flags``, or one of ``FRAME_COLUMNS``, (frames,)."""
-        _check_column(self.path, name, (*FRAME_COLUMNS, FLAGS))
-        return _read(self.path, self.group, name, slice(None))
-
-    def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Write a whole unit of columns, ``thumbnail`` too, from frame ``start`` on."""
-        for name, values in columns.items():
-            self.group[name][start : start + len(values)] = values
+        return self._column(name, (*FRAME_COLUMNS, FLAGS), slice(None))
 
     def files(self, start: int, stop: int) -> list[Path]:
         """Files that hold the frames ``[start, stop)``, a unit, and their columns; and the store's metadata."""
-        raw = [self.path / "raw" / "c" / str(frame) / "0" / "0" for frame in range(start, stop)]
-        unit = start // int(self.group["time_s"].chunks[0])
-        columns = [self.path / name / "c" / str(unit) for name in FRAME_COLUMNS]
-        thumbnails = self.path / "thumbnail" / "c" / str(unit) / "0" / "0"
-        return [*_metadata(self.path), *_existing([*raw, *columns, thumbnails])]
+        raw = (self._file("raw", frame, 0, 0) for frame in range(start, stop))
+        unit = start // int(self["time_s"].chunks[0])
+        columns = (self._file(name, unit) for name in FRAME_COLUMNS)
+        return self._files([*raw, *columns, self._file("thumbnail", unit, 0, 0)])
 
     def thumbnails(self, start: int, stop: int) -> Float32Array:
         """Thumbnails of the frames ``[start, stop)``, (frames, 16, 16), each with its mean removed."""
-        return _read(self.path, self.group, "thumbnail", slice(start, stop))
+        return self._read("thumbnail", slice(start, stop))
 
     def write_flags(self, flags: IntArray) -> Path:
         """Write the column ``flags`` whole, as one chunk; returns its file."""
-        self.group[FLAGS].with_config({"write_empty_chunks": True})[:] = flags
-        return self.path / FLAGS / "c" / "0"
-
-
-def open_frames(path: Path, mode: str = "r") -> FrameStore:
-    """Open ``frames.zarr``."""
-    return FrameStore(path, _open(path, mode))
+        self[FLAGS].with_config({"write_empty_chunks": True})[:] = flags
+        return self._file(FLAGS, 0)
 
 
 # ------------------------------------------------------------------------------------------------------- registration
@@ -264,66 +252,47 @@ REGISTRATION_COLUMNS: dict[str, str] = {
     "heldout_px": "float32",  # RMS of the control points held out of the fit
     "coverage": "float32",  # fraction of the frame's cells that hold inliers
 }
-
-
 ERROR_CELLS = (6, 8)
 """Rows and columns of a frame's cells, in which hold-out errors are stored."""
-
-
 POSITION_SD_CELLS = (24, 32)
 """Rows and columns of a frame's cells, in which the standard deviation of its map is stored."""
-_CELL_ARRAYS = ("error_px", "position_sd_px")
+_CELL_ARRAYS = {"error_px": ERROR_CELLS, "position_sd_px": POSITION_SD_CELLS}
 
 
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
     """Create ``registration.zarr``: chunks are units, so that a unit has one writer."""
-    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
-    chunk = min(unit_frames, max(count, 1))
-    _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
-    _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
-    for name, dtype in REGISTRATION_COLUMNS.items():
-        _create(group, name, (count,), (chunk,), dtype, fill_value=fill_value(dtype), dimension_names=("frame",))
-    axes = ("frame", "row", "column")
-    for name, cells in zip(_CELL_ARRAYS, (ERROR_CELLS, POSITION_SD_CELLS), strict=True):
-        shape, chunks = (count, *cells), (chunk, *cells)
-        _create(group, name, shape, chunks, "float32", fill_value=np.nan, dimension_names=axes)
+    group = _new_group(path, {})
+    columns = {
+        "vector": ("float64", np.nan, (vector_length,)),
+        "status": ("uint8", 0, (_STATUS_BYTES,)),
+        **{name: (dtype, fill_value(dtype), ()) for name, dtype in REGISTRATION_COLUMNS.items()},
+        **{name: ("float32", np.nan, cells) for name, cells in _CELL_ARRAYS.items()},
+    }
+    _create_columns(group, count, unit_frames, columns)
     group.attrs["key"] = key
 
 
-@dataclass(frozen=True)
-class RegistrationStore:
+class RegistrationStore(_ByFrame):
     """``registration.zarr``, opened."""
 
-    path: Path
-    group: _Group
+    _main = "vector"
 
     def write(
         self, start: int, vectors: FloatArray, statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
     ) -> None:
         """Write a whole unit from frame ``start`` on; ``columns`` are ``REGISTRATION_COLUMNS`` and those by cell."""
-        stop = start + len(statuses)
-        text = np.zeros((len(statuses), _STATUS_BYTES), np.uint8)
-        for row, status in zip(text, statuses, strict=True):
-            data = np.frombuffer(status.encode()[:_STATUS_BYTES], np.uint8)
-            row[: len(data)] = data
-        self.group["vector"][start:stop] = vectors
-        self.group["status"][start:stop] = text
-        for name, values in columns.items():
-            self.group[name][start:stop] = values
+        text = np.array([status.encode()[:_STATUS_BYTES] for status in statuses], f"S{_STATUS_BYTES}")
+        rows = text.view(np.uint8).reshape(-1, _STATUS_BYTES)
+        self.write_columns(start, {"vector": vectors, "status": rows, **columns})
 
     @property
     def unit_frames(self) -> int:
         """Frames of a chunk."""
-        return int(self.group["vector"].chunks[0])
-
-    def check_frame(self, frame: int) -> int:
-        """The frame itself; InputError where there is none of this number."""
-        _check_frame(self.path, frame, self.group["vector"].shape[0])
-        return frame
+        return int(self["vector"].chunks[0])
 
     def statuses(self, start: int = 0, stop: int | None = None) -> list[str]:
         """``ok``, ``failed:<reason>`` or ``skipped:<reason>`` of each frame; empty where not processed yet."""
-        rows = _read(self.path, self.group, "status", slice(start, stop))
+        rows = self._read("status", slice(start, stop))
         return [bytes(row).rstrip(b"\0").decode(errors="replace") for row in rows]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
@@ -333,24 +302,19 @@ class RegistrationStore:
         frame is not registered; ``error_px``, (frames, 6, 8): hold-out error by cell; ``position_sd_px``, (frames,
         rows, columns): standard deviation of the maps by cell, NaN where there are no control points.
         """
-        _check_column(self.path, name, (*REGISTRATION_COLUMNS, "vector", *_CELL_ARRAYS))
-        return _read(self.path, self.group, name, slice(start, stop))
+        return self._column(name, (*REGISTRATION_COLUMNS, "vector", *_CELL_ARRAYS), slice(start, stop))
 
     def files(self, start: int) -> list[Path]:
         """Files that hold the unit from frame ``start`` on, and the store's metadata."""
-        unit = start // int(self.group["vector"].chunks[0])
-        tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
-        columns = [self.path / name / "c" / str(unit) for name in REGISTRATION_COLUMNS]
-        cells = [self.path / name / "c" / str(unit) / "0" / "0" for name in _CELL_ARRAYS]
-        return [*_metadata(self.path), *_existing([*tables, *columns, *cells])]
-
-
-def open_registration(path: Path, mode: str = "r") -> RegistrationStore:
-    """Open ``registration.zarr``."""
-    return RegistrationStore(path, _open(path, mode))
+        unit = start // self.unit_frames
+        tables = (self._file(name, unit, 0) for name in ("vector", "status"))
+        columns = (self._file(name, unit) for name in REGISTRATION_COLUMNS)
+        return self._files([*tables, *columns, *(self._file(name, unit, 0, 0) for name in _CELL_ARRAYS)])
 
 
 # -------------------------------------------------------------------------------------------------------------- field
+
+_AXES, _METRIC = ("y", "x", "vy", "vx"), "_m_per_s"
 
 
 def create_field(
@@ -377,33 +341,32 @@ def create_field(
     layers : name -> type, attributes
         (y, x) layers beside the histogram.
     """
-    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, **attributes})
+    group = _new_group(path, attributes)
     n = len(velocities_px_per_s)
     grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
-    for name, own_attributes in histograms.items():
-        histogram = _create(
-            group,
-            name,
-            (height, width, n, n),
-            (block_side(tile), block_side(tile), n, n),
-            "int32",
-            shards=(tile, tile, n, n),
-            fill_value=0,
-            dimension_names=("y", "x", "vy", "vx"),
-        )
-        histogram.attrs.update({**own_attributes, **grid_mapping})
+    about: dict[str, Any]
+    for name, own in histograms.items():
+        shape, blocks = (height, width, n, n), (block_side(tile), block_side(tile), n, n)
+        about = {"shards": (tile, tile, n, n), "dimension_names": _AXES, "attributes": {**own, **grid_mapping}}
+        _create(group, name, shape, blocks, "int32", fill_value=0, **about)
     side = tile * group_tiles
     for name, (dtype, attrs) in layers.items():
-        layer = _create(
-            group, name, (height, width), (side, side), dtype,
-            fill_value=fill_value(dtype), dimension_names=("y", "x"),
-        )  # fmt: skip
-        layer.attrs.update({**attrs, **grid_mapping})
-    _write_axes(group, height, width, velocities_px_per_s, attributes)
+        about = {"dimension_names": ("y", "x"), "attributes": {**attrs, **grid_mapping}}
+        _create(group, name, (height, width), (side, side), dtype, fill_value=fill_value(dtype), **about)
+    axes: list[tuple[str, str, FloatArray, str]] = [
+        ("y", "", np.arange(height, dtype=np.float64), "px"),
+        ("x", "", np.arange(width, dtype=np.float64), "px"),
+        *((name, "", velocities_px_per_s, "px s-1") for name in ("vy", "vx")),
+    ]
+    if gsd_m := attributes.get("gsd_m"):
+        axes += [(name, _METRIC, velocities_px_per_s * float(gsd_m), "m s-1") for name in ("vy", "vx")]
+    for name, metric, values, units in axes:
+        about = {"dimension_names": (name,), "attributes": {"units": units}}
+        _create(group, name + metric, values.shape, values.shape, "float64", **about)[:] = values
+    if attributes.get("crs_wkt"):
+        about = {"crs_wkt": attributes["crs_wkt"], "GeoTransform": attributes.get("geotransform", "")}
+        _create(group, "crs", (), (), "int32", fill_value=0, attributes=about)
     group.attrs["key"] = key
-
-
-_AXES, _METRIC = ("y", "x", "vy", "vx"), "_m_per_s"
 
 
 def is_of_creation(name: str) -> bool:
@@ -416,42 +379,21 @@ def is_of_creation(name: str) -> bool:
     }
 
 
-def _write_axes(
-    group: zarr.Group, height: int, width: int, velocities: FloatArray, attributes: Mapping[str, Any]
-) -> None:
-    axes: dict[str, tuple[FloatArray, str]] = {
-        "y": (np.arange(height, dtype=np.float64), "px"),
-        "x": (np.arange(width, dtype=np.float64), "px"),
-        "vy": (velocities, "px s-1"),
-        "vx": (velocities, "px s-1"),
-    }
-    for name, (values, units) in axes.items():
-        axis = _create(group, name, values.shape, values.shape, "float64", dimension_names=(name,))
-        axis[:] = values
-        axis.attrs["units"] = units
-    gsd_m = attributes.get("gsd_m")
-    if gsd_m:
-        for name in ("vy", "vx"):
-            metric = _create(
-                group, f"{name}{_METRIC}", velocities.shape, velocities.shape, "float64", dimension_names=(name,)
-            )
-            metric[:] = velocities * float(gsd_m)
-            metric.attrs["units"] = "m s-1"
-    if attributes.get("crs_wkt"):
-        crs = _create(group, "crs", (), (), "int32", fill_value=0)
-        crs.attrs.update({"crs_wkt": attributes["crs_wkt"], "GeoTransform": attributes.get("geotransform", "")})
-
-
-@dataclass(frozen=True)
-class FieldStore:
+class FieldStore(_Store):
     """``field.zarr``, opened."""
-
-    path: Path
-    group: _Group
 
     @property
     def attributes(self) -> dict[str, Any]:
-        return dict(self.group.attrs)
+        return dict(self._group.attrs)
+
+    @cached_property
+    def _by_axes(self) -> dict[int, list[str]]:
+        """Names of the arrays by their number of axes, sorted."""
+        self._arrays |= dict(self._group.arrays())
+        names: dict[int, list[str]] = {}
+        for name in sorted(self._arrays):
+            names.setdefault(self._arrays[name].ndim, []).append(name)
+        return names
 
     @property
     def tile(self) -> int:
@@ -460,29 +402,26 @@ class FieldStore:
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width) of the base image, px."""
-        height, width = self.group[HISTOGRAM].shape[:2]
+        height, width = self[HISTOGRAM].shape[:2]
         return int(height), int(width)
 
     def velocities(self) -> FloatArray:
         """Bin centres, px/s."""
-        return np.asarray(self.group["vx"][:])
+        return np.asarray(self["vx"][:])
 
     def histogram_names(self) -> list[str]:
         """Names of the (y, x, vy, vx) histograms."""
-        return [name for name in (HISTOGRAM, HISTOGRAM_TIME_WEIGHTED) if name in self.group.by_axes.get(4, ())]
+        return [name for name in (HISTOGRAM, HISTOGRAM_TIME_WEIGHTED) if name in self._by_axes.get(4, ())]
 
     def write_tile(
         self, row: int, column: int, histogram: NDArray[np.int32], count: NDArray[np.int32], name: str = HISTOGRAM
     ) -> None:
         """Write one tile of a histogram, (ty, tx, nvy, nvx), zero where ``count`` (ty, tx) is: one file."""
-        write_atomically(self._tile_path(row, column, name), encode_tile(histogram, count, self.tile), sync=False)
-
-    def _tile_path(self, row: int, column: int, name: str) -> Path:
-        return self.path / name / "c" / str(row) / str(column) / "0" / "0"
+        write_atomically(self._file(name, row, column, 0, 0), encode_tile(histogram, count, self.tile), sync=False)
 
     def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
         """Whether the tile's file exists."""
-        return self._tile_path(row, column, name).exists()
+        return self._file(name, row, column, 0, 0).exists()
 
     def read_tile(
         self, row: int, column: int, name: str = HISTOGRAM, *, into: NDArray[np.int32] | None = None
@@ -497,61 +436,52 @@ class FieldStore:
         StoreError
             The tile is damaged or gone.
         """
-        height, width, *bins = self.group[name].shape
+        height, width, *bins = self[name].shape
         side = self.tile
         shape = (min(side, height - row * side), min(side, width - column * side), *bins)
         try:
             into = None if into is None or into.shape != shape else into
-            return decode_tile(self._tile_path(row, column, name).read_bytes(), shape, side, into=into)
+            return decode_tile(self._file(name, row, column, 0, 0).read_bytes(), shape, side, into=into)
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
 
     def write_layer(self, name: str, group: tuple[int, int], values: NDArray[Any]) -> None:
         """Write a layer of one group, (y, x), smaller than the others at the map's edge: one file, none if empty."""
-        path, array = self._layer_path(name, group), self.group[name]
+        path, array = self._file(name, *group), self[name]
         chunk = encode_chunk(values, array.chunks, array.fill_value)
         if chunk is None:
             path.unlink(missing_ok=True)
         else:
             write_atomically(path, chunk, sync=False)
 
-    def _layer_path(self, name: str, group: tuple[int, int]) -> Path:
-        return self.path / name / "c" / str(group[0]) / str(group[1])
-
     def layer(self, name: str) -> NDArray[Any]:
         """A whole layer, (y, x)."""
-        return _read(self.path, self.group, name, slice(None))
+        return self._read(name, slice(None))
 
     def files(self, tiles: Iterable[tuple[int, int]], group: tuple[int, int]) -> list[Path]:
         """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
-        places = list(tiles)
-        histogram = [self._tile_path(*place, name) for name in self.histogram_names() for place in places]
-        layers = [self._layer_path(name, group) for name in self.layer_names()]
-        axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
-        return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
+        places = [*tiles]
+        histogram = (self._file(name, *place, 0, 0) for name in self.histogram_names() for place in places)
+        layers = (self._file(name, *group) for name in self.layer_names())
+        return self._files([*histogram, *layers, *(self._file(name, 0) for name in self._by_axes.get(1, ()))])
 
     def layer_names(self) -> list[str]:
         """Names of the (y, x) layers, sorted."""
-        return self.group.by_axes.get(2, [])
+        return self._by_axes.get(2, [])
 
     def layer_attributes(self, name: str) -> dict[str, Any]:
         """Units and long name of a layer."""
-        return dict(self.group[name].attrs)
+        return dict(self[name].attrs)
 
     def chunk_shape(self, name: str) -> tuple[int, int]:
         """(height, width) of what one file of an array holds, px."""
-        array = self.group[name]
+        array = self[name]
         height, width = (array.shards or array.chunks)[:2]
         return int(height), int(width)
 
     def stored_chunks(self, name: str) -> list[tuple[int, int]]:
         """(row, column) of the stored chunks of an array; those of only the fill value are not stored."""
         return sorted((int(path.parent.name), int(path.name)) for path in (self.path / name / "c").glob("*/*"))
-
-
-def open_field(path: Path, mode: str = "r") -> FieldStore:
-    """Open ``field.zarr``."""
-    return FieldStore(path, _open(path, mode))
 
 
 # ------------------------------------------------------------------------------------------------------------- viewer
@@ -562,7 +492,7 @@ _LAYER_CHUNK_PX = 512
 
 def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write ``view/segments.zarr``: columns of one length, (segments,) each; every chunk is stored."""
-    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
+    group = _new_group(path, {})
     for name, values in columns.items():
         chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
         column = _create(group, name, values.shape, chunk, values.dtype.name, dimension_names=("segment",))
@@ -571,15 +501,13 @@ def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 def read_segment_tracks(path: Path) -> IntArray:
     """Column ``track`` of ``view/segments.zarr``, (segments,)."""
-    group = zarr.open_group(**_location(path), mode="r")
-    return np.asarray(cast("zarr.Array[Any]", group["track"])[:], np.int64)
+    return np.asarray(_Store(path)["track"][:], np.int64)
 
 
 def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
-    """Write float32 (y, x) layers with their attributes, shown beside the field's own; `open_field` reads them."""
-    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
+    """Write float32 (y, x) layers with their attributes, shown beside the field's own; `FieldStore` reads them."""
+    group = _new_group(path, {})
     for name, (values, attributes) in layers.items():
         chunk = (_LAYER_CHUNK_PX, _LAYER_CHUNK_PX)
-        layer = _create(group, name, values.shape, chunk, "float32", fill_value=np.nan, dimension_names=("y", "x"))
-        layer[:] = values
-        layer.attrs.update(dict(attributes))
+        about: dict[str, Any] = {"fill_value": np.nan, "dimension_names": ("y", "x"), "attributes": dict(attributes)}
+        _create(group, name, values.shape, chunk, "float32", **about)[:] = values

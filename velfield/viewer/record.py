@@ -32,7 +32,6 @@ from velfield.run.run import Run, open_run
 from velfield.run.stores import (
     HISTOGRAM,
     FieldStore,
-    open_field,
     read_segment_tracks,
     write_extra_layers,
     write_segments,
@@ -83,7 +82,7 @@ def _write_animations(run: Run, segments: Segments, vehicles: pd.DataFrame) -> l
     files = {view / "replay" / f"{k}.bin": content for k, content in enumerate(chunks)}
     slow = stationary_speed_px_per_s(run.record.config.field, grid.gsd_m)
     files[view / "flow.bin"] = flow_bytes(
-        open_field(run.layout.field), gsd_m=grid.gsd_m, stationary_speed_px_per_s=slow
+        FieldStore(run.layout.field), gsd_m=grid.gsd_m, stationary_speed_px_per_s=slow
     )
     for path, content in files.items():
         write_atomically(path, content)
@@ -99,9 +98,9 @@ def _span(times_s: FloatArray) -> tuple[float, float]:
 def write_view_record(layout: RunLayout) -> None:
     """Write ``view/run.json``: after `write_view_data`, and after each change of the field's layers."""
     run = open_run(layout.root)
-    stores = {"field.zarr": open_field(layout.field)}
+    stores = {"field.zarr": FieldStore(layout.field)}
     if layout.view_changes.exists():
-        stores["view/change.zarr"] = open_field(layout.view_changes)
+        stores["view/change.zarr"] = FieldStore(layout.view_changes)
     record = view_record(run.record, run.grid, stores, read_segment_tracks(layout.view_segments), run.times_s)
     write_atomically(layout.view_record, record.model_dump_json().encode())
 

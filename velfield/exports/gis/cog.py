@@ -12,7 +12,7 @@ from rasterio.transform import Affine
 from schemas.export import ExportOptions
 from velfield.run.commits import write_atomically
 from velfield.run.run import Run
-from velfield.run.stores import open_field
+from velfield.run.stores import FieldStore
 from velfield.sources.geo import ignore_missing_georeference
 
 FILE_NAME = "field.tif"
@@ -21,9 +21,9 @@ AffineCoefficients = tuple[float, float, float, float, float, float]
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """All layers of the field as bands of float32, in SI units where metres are known: see `ExportModule`."""
-    store, grid = open_field(run.layout.field), run.grid
+    store, grid = FieldStore(run.layout.field), run.grid
     names = store.layer_names()
-    units = [str(store.group[name].attrs.get("units", "1")) for name in names]
+    units = [str(store.layer_attributes(name).get("units", "1")) for name in names]
     factors = [grid.gsd_m if grid.gsd_m and unit == "px s-1" else 1.0 for unit in units]
     return cog_bytes(
         [

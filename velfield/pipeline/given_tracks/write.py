@@ -25,7 +25,7 @@ from velfield.pipeline.stages.frames import create_frame_store
 from velfield.pipeline.stages.registration import create_registration_store
 from velfield.run.commits import POSITION_SD_M, write_atomically
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 from velfield.run.tables import conform, empty_table, write_table, write_tracks
 from velfield.sources.geo import BaseRaster
 from velfield.sources.selection import select_frames
@@ -144,7 +144,7 @@ def _write_stores(plan: Plan) -> list[Path]:
     stores = replace(plan, keys=plan.keys | dict.fromkeys(of_images, plan.keys["tracks"]))
     create_frame_store(stores)
     create_registration_store(stores)
-    store, written = open_frames(plan.layout.frames, "r+"), []
+    store, written = FrameStore(plan.layout.frames, "r+"), []
     for frames in plan.units:
         times_s = plan.info.times_s[frames.start : frames.stop]
         store.write_columns(frames.start, {"time_s": times_s, "source_index": plan.indices[frames.start : frames.stop]})

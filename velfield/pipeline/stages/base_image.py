@@ -33,7 +33,7 @@ from velfield.report.figures import png_bytes
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import base_mesh_to_record, read_lens
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 from velfield.sources.geo import BaseRaster, reconcile_gsd
 
 _LENS_ROUNDS = 4
@@ -66,7 +66,7 @@ def build_base(plan: Plan) -> StageResult:
     if given is not None:
         reconcile_gsd(given.gsd_m, plan.config.gsd_m)  # the stage `georeference` does it again, after much work
     plan.layout.map_lens.unlink(missing_ok=True)
-    lens, store, layout = read_lens(plan.layout), open_frames(plan.layout.frames), plan.layout
+    lens, store, layout = read_lens(plan.layout), FrameStore(plan.layout.frames), plan.layout
     sharpness = store.column("sharpness")
     lens_notes: list[str] = []
     spread = _spread_frames(plan)
@@ -130,7 +130,7 @@ def _build_own_base(
 
     The sharpest frame may be one of few that look elsewhere or obliquely: then another one is tried.
     """
-    store, tried = open_frames(plan.layout.frames), []
+    store, tried = FrameStore(plan.layout.frames), []
     for reference in references:
         own = build_own_base(
             store.read,

@@ -14,7 +14,7 @@ from velfield.pipeline.result import advance
 from velfield.pipeline.stages.rectified_frames import WorkingGrid
 from velfield.pipeline.stages.registration import spread_usable_frames
 from velfield.run.frame_transforms import read_own_grid
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 
 _FRAMES = 3
 _GSD_RANGE_M = 0.02, 0.6
@@ -64,7 +64,7 @@ def contradict_metadata(plan: Plan, metadata: ScaleEstimate) -> ScaleEstimate | 
 
 def in_light_of_flight(plan: Plan, detector: Detector) -> Detector:
     """The detector, adjusted to how bright the flight's frames are."""
-    store = open_frames(plan.layout.frames)
+    store = FrameStore(plan.layout.frames)
     return detector.in_light_of([store.read(frame) for frame in spread_usable_frames(plan, _FRAMES)])
 
 

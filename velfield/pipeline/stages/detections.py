@@ -26,7 +26,7 @@ from velfield.pipeline.stages.rectified_frames import Window, WorkingFrame, Work
 from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.registration.transforms import FrameMap
 from velfield.run.frame_transforms import read_working
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 from velfield.run.tables import write_arrays, write_table
 
 _AXIS_SD_RAD = 0.1
@@ -108,7 +108,7 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     """Detect the cars of the registered frames of a block."""
     record = read_working(plan.layout)
     working = WorkingGrid.open(plan, record.scale)
-    times_s = open_frames(plan.layout.frames).column("time_s")
+    times_s = FrameStore(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
     search = _searcher(plan, working, usable)
     parts = []
@@ -137,7 +137,7 @@ def _searcher(plan: Plan, working: WorkingGrid, usable: Mask) -> "Callable[[int]
     detector = _detector(plan.layout.detector, plan.keys["detector"])
     if not detector.reads_raw_frames:
         return _Search(plan, working, usable, detector).detect
-    store, threshold = open_frames(plan.layout.frames), plan.config.detection.threshold
+    store, threshold = FrameStore(plan.layout.frames), plan.config.detection.threshold
 
     def search(frame: int) -> "_Found | None":
         found = _from_boxes(plan, working, frame, detector.detect_raw(store.read(frame), threshold=threshold))

@@ -34,7 +34,7 @@ from velfield.pipeline.stages.rectified_frames import WorkingGrid
 from velfield.pipeline.stages.registration import external_boxes, spread_usable_frames
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_first_grid
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 
 _MIN_CAR_PX = 5.0
 """The shipped network finds next to nothing of shorter cars, and searches images a hundred times as large for them."""
@@ -68,7 +68,7 @@ def _scale_of_boxes(plan: Plan, detector: Detector) -> float:
     known = _scale_of_gsd(plan)
     if known is not None:
         return known
-    store, chosen = open_frames(plan.layout.frames), spread_usable_frames(plan, _FRAMES_TO_MEASURE)
+    store, chosen = FrameStore(plan.layout.frames), spread_usable_frames(plan, _FRAMES_TO_MEASURE)
     threshold = plan.config.detection.threshold
     boxes = pd.concat([detector.detect_raw(store.read(frame), threshold=threshold) for frame in chosen])
     if boxes.empty:

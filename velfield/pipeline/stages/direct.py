@@ -21,7 +21,7 @@ from velfield.registration.frame_fit import BaseReference, FrameRegistration
 from velfield.registration.intrasensor import prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints
 from velfield.run.commits import write_atomically
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 from velfield.sources.geo import BaseRaster
 
 _N_TRIALS = 8
@@ -57,7 +57,7 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
 
     Where their control points decide for another lens, it is written to ``base/lens.json``.
     """
-    config, store = plan.config.registration, open_frames(plan.layout.frames)
+    config, store = plan.config.registration, FrameStore(plan.layout.frames)
     shape = (plan.info.height, plan.info.width)
     reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=shape)
     frames = trial_frames(sorted(keypoints))

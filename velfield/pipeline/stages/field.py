@@ -27,7 +27,7 @@ from velfield.pipeline.result import StageResult, advance
 from velfield.run.field_writer import Group, GroupWriter, create_field_store, tile_groups
 from velfield.run.frame_transforms import read_grid
 from velfield.run.layout import remove_tree
-from velfield.run.stores import FIELD_BLOCK, open_field, store_key
+from velfield.run.stores import FIELD_BLOCK, FieldStore, store_key
 from velfield.run.tables import read_tables
 
 _PLACE_COLUMNS = ["track_id", *(f"{axis}_{k}_px" for k in range(3) for axis in "xy")]
@@ -83,7 +83,7 @@ def accumulate_block(plan: Plan, block: Group) -> StageResult:
     grid, config = read_grid(plan.layout), plan.config.field
     bins, weight = VelocityBins.from_config(config, grid.gsd_m), field_weight(config)
     make = partial(GroupWriter, grid=grid, config=config, bins=bins, zeros=[])
-    store = open_field(plan.layout.field, "r+")
+    store = FieldStore(plan.layout.field, "r+")
     writers = [make(store, group) for group in _list_groups(plan, block)]
     segments = _segments_near(plan, writers)
     for writer in writers:
@@ -92,7 +92,7 @@ def accumulate_block(plan: Plan, block: Group) -> StageResult:
     number = assign_intervals(segments, [part for _, part in parts]) if parts else None
     interval_writers = []
     for k, (path, _) in enumerate(parts):
-        store = open_field(path, "r+")
+        store = FieldStore(path, "r+")
         for group in _list_groups(plan, block):
             interval_writers.append(make(store, group))
             accumulate_into(interval_writers[-1], segments[number == k], weight=weight, time_weighted=False)

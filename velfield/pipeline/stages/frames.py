@@ -18,7 +18,7 @@ from velfield.errors import InputError
 from velfield.parallel import for_each_behind
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, is_cut_as, open_frames
+from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, is_cut_as
 from velfield.sources.frame_measures import frame_quality
 from velfield.sources.frames import SourceFrame
 from velfield.sources.quality import (
@@ -48,7 +48,7 @@ def flag_frames(plan: Plan) -> StageResult:
     InputError
         Fewer than three frames are without a fault.
     """
-    store = open_frames(plan.layout.frames, "r+")
+    store = FrameStore(plan.layout.frames, "r+")
     flags = store.column("decoding_flags")
     tested = np.flatnonzero((flags & int(UNUSABLE)) == 0)
     blurred = tested[flag_blurred(store.column("sharpness")[tested])]
@@ -127,7 +127,7 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
 
     A unit of which no frame is readable is written like any other: `flag_frames` judges the recording as a whole.
     """
-    store = open_frames(plan.layout.frames, "r+")
+    store = FrameStore(plan.layout.frames, "r+")
     indices = plan.indices[frames.start : frames.stop]
     before = int(plan.indices[frames.start - 1]) if frames.start else None
     flags = np.zeros(len(frames), np.uint16)

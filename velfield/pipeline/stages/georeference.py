@@ -29,7 +29,7 @@ from velfield.run.frame_transforms import (
     read_own_grid,
 )
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_frames, open_registration
+from velfield.run.stores import FrameStore, RegistrationStore
 from velfield.sources.capture_times import read_flight_start
 from velfield.sources.clips import read_clips_telemetry
 from velfield.sources.geo import reconcile_gsd
@@ -178,7 +178,7 @@ def with_control_points(record: GeoreferenceRecord, points: ControlPointsRecord)
 
 def _start(plan: Plan) -> FlightStart | None:
     """When the run's first frame was taken."""
-    given, times_s = plan.job.inputs.telemetry, open_frames(plan.layout.frames).column("time_s")
+    given, times_s = plan.job.inputs.telemetry, FrameStore(plan.layout.frames).column("time_s")
     start = read_flight_start(Path(plan.job.inputs.source), plan.info, Path(given) if given else None)
     if start is None or not len(times_s):
         return None
@@ -194,10 +194,10 @@ def _frame_poses(plan: Plan) -> FramePoses | Failure:
     if isinstance(telemetry, Failure):
         return telemetry
     transforms = FrameTransforms.open(plan.layout, plan.config)
-    statuses = open_registration(plan.layout.registration).statuses()
+    statuses = RegistrationStore(plan.layout.registration).statuses()
     registered = [frame for frame, status in enumerate(statuses) if status == "ok"]
     chosen = [registered[k] for k in np.unique(np.linspace(0, len(registered) - 1, _MAX_FRAMES).astype(int))]
-    times_s = open_frames(plan.layout.frames).column("time_s")
+    times_s = FrameStore(plan.layout.frames).column("time_s")
     maps = [(frame, found) for frame in chosen if (found := transforms.transform(frame)) is not None]
     if not maps:
         return Failure("no frame is registered")

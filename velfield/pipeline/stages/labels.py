@@ -19,7 +19,7 @@ from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.run.frame_transforms import FrameTransforms
-from velfield.run.stores import open_registration
+from velfield.run.stores import RegistrationStore
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.labels import Labels, read_labels
 from velfield.sources.quality import UNUSABLE
@@ -49,7 +49,7 @@ def labels_of_run(plan: Plan) -> Labels:
 def base_px_per_raw_px(plan: Plan) -> float:
     """Local scale of the map raw -> base at the frames' centre: the median over registered frames."""
     maps = FrameTransforms.open(plan.layout, plan.config)
-    statuses = open_registration(plan.layout.registration).statuses()
+    statuses = RegistrationStore(plan.layout.registration).statuses()
     registered = [k for k, status in enumerate(statuses) if status == "ok"]
     if not registered:
         raise InputError("no frame could be registered; the video must show one place from above")

@@ -14,7 +14,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.pairing import match_frame_pairs
 from velfield.run.commits import write_atomically
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 from velfield.sources.quality import UNUSABLE
 
 _TILT_FRAMES = 3
@@ -23,7 +23,7 @@ _TILT_FRAMES = 3
 
 def select_usable_frames(plan: Plan, count: int) -> list[int]:
     """At most ``count`` frames, evenly sampled from those without a fault."""
-    flags = open_frames(plan.layout.frames).column("flags")
+    flags = FrameStore(plan.layout.frames).column("flags")
     usable = np.flatnonzero((flags & int(UNUSABLE)) == 0)
     indices: IntArray = np.unique(np.linspace(0, max(len(usable) - 1, 0), min(count, len(usable))).round()).astype(int)
     return [int(frame) for frame in usable[indices]]
@@ -31,7 +31,7 @@ def select_usable_frames(plan: Plan, count: int) -> list[int]:
 
 def calibrate_flight(plan: Plan) -> StageResult:
     """Calibrate the lens and write ``camera.json``; the pinhole model if ``lens.calibrate`` is ``never``."""
-    store = open_frames(plan.layout.frames)
+    store = FrameStore(plan.layout.frames)
     height, width = store.shape
     config = plan.config.lens
     if config.calibrate == "never":

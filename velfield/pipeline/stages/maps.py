@@ -19,7 +19,7 @@ from velfield.report.figures import MapScale, direction_figure, png_bytes, speed
 from velfield.report.quality_figures import registration_error_figure, undistortion_figure
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import heading_deg, north_direction_rad, read_base_image, read_grid, read_lens
-from velfield.run.stores import open_field, open_frames, open_registration
+from velfield.run.stores import FieldStore, FrameStore, RegistrationStore
 from velfield.sources.geo import ignore_missing_georeference
 from velfield.viewer.record import write_view_data
 
@@ -60,7 +60,7 @@ def make_maps(plan: Plan) -> StageResult:
 
 def _modal_velocity(plan: Plan) -> tuple[Mask, FloatArray]:
     """Where a velocity is known, (y, x), and the velocities there, (n, 2) px/s."""
-    store = open_field(plan.layout.field)
+    store = FieldStore(plan.layout.field)
     layers = store.layer("modal_vx"), store.layer("modal_vy")
     known = np.isfinite(layers[0]) & np.isfinite(layers[1])
     return known, np.stack([layer[known] for layer in layers], axis=-1).astype(np.float64)
@@ -121,11 +121,11 @@ def make_preview(figure: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _write_quality_figures(plan: Plan) -> list[Path]:
     """Write ``maps/registration.png``, and ``maps/lens.png`` where the lens has distortion."""
     layout = plan.layout
-    errors = open_registration(layout.registration).column("error_px")
+    errors = RegistrationStore(layout.registration).column("error_px")
     seen = np.isfinite(errors).any(axis=(1, 2))
     if not seen.any():
         return []
-    grey = open_frames(layout.frames).read(int(np.flatnonzero(seen)[0]))
+    grey = FrameStore(layout.frames).read(int(np.flatnonzero(seen)[0]))
     known = np.isfinite(errors)
     mean_square = np.sum(np.where(known, errors, 0.0) ** 2, axis=0) / np.maximum(known.sum(axis=0), 1)
     by_cell = np.where(known.any(axis=0), np.sqrt(mean_square), np.nan)

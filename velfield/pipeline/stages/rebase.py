@@ -43,7 +43,7 @@ from velfield.run.frame_transforms import (
 )
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
-from velfield.run.stores import open_registration
+from velfield.run.stores import RegistrationStore
 from velfield.run.tables import link_file, read_tables, write_table, write_tracks
 from velfield.sources.frames import SourceInfo
 from velfield.sources.geo import BaseRaster, read_base_raster
@@ -90,7 +90,7 @@ def plan_rebase(run: Run, job: Job, record: RebaseRecord) -> Plan:
     digest = digest_path(Path(job.inputs.base))
     inputs = run.record.inputs.model_copy(update={"base": digest})
     # Of the length that the run's files were cut by: another release may cut others.
-    unit_frames = open_registration(run.layout.registration).unit_frames
+    unit_frames = RegistrationStore(run.layout.registration).unit_frames
     work = job.config.work.model_copy(update={"unit_frames": unit_frames})
     config = job.config.model_copy(update={"gsd_m": record.gsd_m, "work": work})
     return Plan(

@@ -12,7 +12,7 @@ from velfield.pipeline.plan import Plan
 from velfield.registration.transforms import FrameMap
 from velfield.registration.warp import Rectification, footprint, warp_to_base
 from velfield.run.frame_transforms import FrameTransforms, read_grid
-from velfield.run.stores import FrameStore, open_frames
+from velfield.run.stores import FrameStore
 
 Window = tuple[int, int, int, int]
 """x, y, width, height in base px."""
@@ -59,7 +59,7 @@ class WorkingGrid:
     def open(cls, plan: Plan, scale: float) -> "WorkingGrid":
         """The working grid of a plan's run folder at a scale."""
         maps = FrameTransforms.open(plan.layout, plan.config)
-        return cls(open_frames(plan.layout.frames), maps, read_grid(plan.layout), scale)
+        return cls(FrameStore(plan.layout.frames), maps, read_grid(plan.layout), scale)
 
     def frame(self, frame: int, window: Window | None = None) -> WorkingFrame | None:
         """One frame; none where it is not registered or does not meet the base image. ``window`` none: its

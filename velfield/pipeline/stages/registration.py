@@ -28,11 +28,10 @@ from velfield.run.stores import (
     POSITION_SD_CELLS,
     REGISTRATION_COLUMNS,
     FrameStore,
+    RegistrationStore,
     create_registration,
     fill_value,
     is_cut_as,
-    open_frames,
-    open_registration,
 )
 from velfield.run.tables import read_arrays, write_arrays
 from velfield.sources.geo import BaseRaster, read_base_raster
@@ -68,7 +67,7 @@ def create_registration_store(plan: Plan) -> None:
 
 def register_unit(plan: Plan, frames: range) -> StageResult:
     """Chain a unit's frames in chains of ``chain_length_frames``, each started from the base image."""
-    store = open_frames(plan.layout.frames)
+    store = FrameStore(plan.layout.frames)
     flags = store.column("flags")
     reference, lens, config = base_reference(plan), read_lens(plan.layout), plan.config.registration
     results: dict[int, FrameRegistration] = {}
@@ -118,7 +117,7 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
             errors[k] = result.error_map
         if result.position_sd_px is not None:
             position_sd[k] = result.position_sd_px
-    store = open_registration(plan.layout.registration, "r+")
+    store = RegistrationStore(plan.layout.registration, "r+")
     store.write(frames.start, vectors, statuses, {**columns, "error_px": errors, "position_sd_px": position_sd})
     registered = statuses.count("ok")
     counts = {"frames": float(len(frames)), "registered": float(registered)}
@@ -186,8 +185,8 @@ def ground_convergence(transform: FrameTransform) -> FloatArray:
 
 def usable_frames(plan: Plan) -> Mask:
     """Frames (frames,) that are registered and have no fault."""
-    flags = open_frames(plan.layout.frames).column("flags")
-    statuses = open_registration(plan.layout.registration).statuses()
+    flags = FrameStore(plan.layout.frames).column("flags")
+    statuses = RegistrationStore(plan.layout.registration).statuses()
     registered = np.array([status == "ok" for status in statuses], np.bool_)
     return np.asarray(registered & ((flags & int(UNUSABLE)) == 0), np.bool_)
 
@@ -200,7 +199,7 @@ def spread_usable_frames(plan: Plan, count: int) -> list[int]:
 
 def detect_frame_keypoints(plan: Plan, frame: int) -> Keypoints:
     """Detect the keypoints of a frame, raw px, outside the vehicles of the given boxes."""
-    return _detect_keypoints(plan, frame, open_frames(plan.layout.frames).read(frame))
+    return _detect_keypoints(plan, frame, FrameStore(plan.layout.frames).read(frame))
 
 
 def external_boxes(plan: Plan) -> pd.DataFrame:

@@ -22,7 +22,7 @@ from velfield.run.commits import code_version, record_page, write_atomically
 from velfield.run.flight_record import source_name
 from velfield.run.frame_transforms import north_direction_rad, read_grid, read_working
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_frames, open_registration
+from velfield.run.stores import FrameStore, RegistrationStore
 from velfield.viewer.record import write_view_record
 
 _TRAINING_SOURCES = {
@@ -175,8 +175,8 @@ def _inputs(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _residual(plan: Plan) -> ResidualSeries:
-    times_s = open_frames(plan.layout.frames).column("time_s")
-    heldout = open_registration(plan.layout.registration).column("heldout_px")
+    times_s = FrameStore(plan.layout.frames).column("time_s")
+    heldout = RegistrationStore(plan.layout.registration).column("heldout_px")
     return ResidualSeries(
         times_s=tuple(float(time) for time in times_s),
         residual_px=tuple(float(value) if np.isfinite(value) else None for value in heldout),

@@ -14,7 +14,7 @@ from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
 from velfield.pipeline.units import unit_name
 from velfield.run.frame_transforms import read_tracking_gsd
-from velfield.run.stores import open_frames, open_registration
+from velfield.run.stores import FrameStore, RegistrationStore
 from velfield.run.tables import Arrays, read_arrays, read_tables, write_table
 from velfield.tracking.association import FrameTable, window_frames
 from velfield.tracking.tracklets import link_windows
@@ -32,7 +32,7 @@ def tracklet_files(plan: Plan) -> list[Path]:
 def explain_no_tracklets(plan: Plan) -> str:
     """The reason why there are no tracklets, so that the maps are empty, and the remedy."""
     effect, near_s = "no tracklets, so the maps are empty", plan.config.tracking.max_interval_s
-    times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
+    times_s = FrameStore(plan.layout.frames).column("time_s")[usable_frames(plan)]
     if len(times_s) < 3:
         return f"{effect}: {len(times_s)} frames are registered well enough, 3 or more needed; see registration's notes"
     gaps = np.diff(times_s)
@@ -59,7 +59,7 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
 
     Frames whose detections are lost are passed over, as frames that are not registered are.
     """
-    times_s = open_frames(plan.layout.frames).column("time_s")
+    times_s = FrameStore(plan.layout.frames).column("time_s")
     usable = linkable_frames(plan)
     window = window_frames(list(usable), list(times_s), frames, plan.config.tracking.max_interval_s)
     tables, weak = (frame_tables(plan, window, times_s, usable, weak=which) for which in (False, True))
@@ -142,7 +142,7 @@ def tables_of_units(
 ) -> list[FrameTable]:
     """Detections of a range of frames, by the frames' units, which are read; frames of others are not usable."""
     none = next(iter(units.values()))  # it holds no detections of the frames of others
-    store = open_registration(plan.layout.registration)
+    store = RegistrationStore(plan.layout.registration)
     heldout = store.column("heldout_px", window.start, window.stop).astype(np.float64)
     kept = store.column("n_inliers", window.start, window.stop).astype(np.float64)
     tables: list[FrameTable] = []

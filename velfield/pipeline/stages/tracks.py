@@ -29,7 +29,7 @@ from velfield.pipeline.stages.tracklets import (
 )
 from velfield.run.frame_transforms import FrameTransforms, read_tracking_gsd
 from velfield.run.layout import RunLayout
-from velfield.run.stores import open_frames
+from velfield.run.stores import FrameStore
 from velfield.run.tables import empty_table, read_arrays, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
 from velfield.tracking.dimensions import STRIP_SHAPE, looks, sample_tracks
@@ -73,7 +73,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     candidates = read_candidates(plan, tracklets, gsd_m)
     context = find_context(plan, ends, starts, strips)
     found = recover_tracks(ids, ends, starts, _gap_limits(plan), context, candidates)
-    flight = TrackFrames(open_frames(layout.frames).column("time_s"), linkable_frames(plan))
+    flight = TrackFrames(FrameStore(layout.frames).column("time_s"), linkable_frames(plan))
     positions = all_positions(tracklets.assign(track_id=found.tracks[chain]), found, candidates, gsd_m, flight)
     first_frame = np.array(tracklets["frame_0"])
     del tracklets, candidates, context  # what follows needs no more of them, and they are large
@@ -356,7 +356,7 @@ def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSu
     """Places where chains end and start, and their appearance there."""
     metres = assumed_gsd_m(read_tracking_gsd(plan.layout))
     maps = FrameTransforms.open(plan.layout, plan.config)
-    times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
+    times_s = FrameStore(plan.layout.frames).column("time_s")[usable_frames(plan)]
     first_s, last_s = (times_s[0], times_s[-1]) if len(times_s) else (0.0, 0.0)
     return EndContext(
         _stays_inside(maps, ends, 1, metres) & (last_s - ends.time_s > _HIDDEN_S),
