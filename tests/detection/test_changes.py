@@ -15,7 +15,7 @@ from velfield.detection.crops import oriented_strips
 from velfield.detection.detect import SearchedFrame, changed_cells, search_frame
 from velfield.detection.frame import ComparableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
-from velfield.detection.mosaic import CROP_UNIT_PX, Box, assemble_kernel, find_in_boxes, owners_kernel, pack_boxes
+from velfield.detection.mosaic import CROP_UNIT_PX, Box, Mosaic, assemble, find_in_boxes, find_owners, pack_boxes
 from velfield.detection.registry import shipped_detector
 
 _SHAPE = 300, 420
@@ -144,27 +144,19 @@ def test_crops_of_many_boxes_overlap_nowhere_and_fill_half_of_their_mosaics() ->
     assert CROP_UNIT_PX == ALIGNMENT, "what the network needs"
 
 
-@pytest.mark.parametrize("border", [cv2.BORDER_REFLECT_101, cv2.BORDER_CONSTANT])
-def test_windows_that_reach_beyond_the_image_go_on_as_opencv_continues_them(border: int) -> None:
+@pytest.mark.parametrize(("border", "mode"), [(cv2.BORDER_REFLECT_101, "reflect"), (cv2.BORDER_CONSTANT, "constant")])
+def test_windows_that_reach_beyond_the_image_go_on(border: int, mode: str) -> None:
     image = np.random.default_rng(7).integers(1, 256, (50, 60), dtype=np.uint8)
-    windows = [
-        (-16, -16, 40, 48),
-        (5, 7, 40, 40),
-        (33, 43, 40, 40),
-        (47, 10, 24, 40),
-        (-23, 59, 24, 24),
-        (-8, -8, 80, 90),
-    ]
+    corners = np.array([(-16, -16), (5, 7), (33, 43), (47, 10), (-23, 59), (-8, -8)])
     crops = np.array(
         [(0, 0, 40, 48), (0, 48, 40, 40), (40, 0, 40, 40), (40, 40, 24, 40), (0, 88, 24, 24), (80, 2, 80, 90)]
     )
     expected = np.zeros((160, 112), np.uint8)
-    for (top, left, rows, columns), (y, x, _, _) in zip(windows, crops, strict=True):
+    for (top, left), (y, x, rows, columns) in zip(corners, crops, strict=True):
         inside = image[max(0, top) : top + rows, max(0, left) : left + columns]
-        beyond = max(0, -top), max(0, top + rows - 50), max(0, -left), max(0, left + columns - 60)
-        expected[y : y + rows, x : x + columns] = cv2.copyMakeBorder(inside, *beyond, border)
-    reflected = border == cv2.BORDER_REFLECT_101
-    found = assemble_kernel(image, np.array(windows)[:, :2], crops, 160, 112, reflected)
+        beyond = (max(0, -top), max(0, top + rows - 50)), (max(0, -left), max(0, left + columns - 60))
+        expected[y : y + rows, x : x + columns] = np.pad(inside, beyond, mode=mode)
+    found = assemble(image, corners, Mosaic((160, 112), np.arange(6), crops), border)
     np.testing.assert_array_equal(found, expected)
 
 
@@ -175,7 +167,10 @@ def test_a_position_belongs_to_the_box_that_it_lies_in() -> None:
         owner[top : top + rows, left : left + columns] = number
     xy = np.random.default_rng(8).uniform(-5, 125, (500, 2))
     column, row = (np.clip(np.floor(xy[:, k] + 0.5).astype(int), 0, size - 1) for k, size in ((0, 120), (1, 88)))
-    np.testing.assert_array_equal(owners_kernel(xy, boxes, 88, 120), owner[row, column])
+    expected = owner[row, column]
+    position, box = find_owners(xy, boxes, (88, 120))
+    np.testing.assert_array_equal(position, np.flatnonzero(expected >= 0))
+    np.testing.assert_array_equal(box, expected[position])
 
 
 def test_a_detector_of_another_kind_searches_each_box_by_itself() -> None:

@@ -47,23 +47,6 @@ def difference_kernel(image, other, valid, other_valid, sums, counts, one_only) 
 
 
 @kernel
-def box_sums_kernel(difference: NDArray[np.int16]) -> NDArray[np.int16]:
-    """Sums over boxes of `BOX_PX` at half the resolution, from two pixels before each; beyond the edge it goes on."""
-    height, width = difference.shape
-    out = np.empty((height, width), np.int16)
-    padded = np.empty(width + 3, np.int16)
-    for y in range(height):
-        a, b = difference[max(y - 2, 0)], difference[max(y - 1, 0)]
-        c, d = difference[y], difference[min(y + 1, height - 1)]
-        for x in range(np.uint64(width)):
-            padded[x + np.uint64(2)] = a[x] + b[x] + c[x] + d[x]
-        padded[:2], padded[width + 2] = padded[2], padded[width + 1]
-        for x in range(np.uint64(width)):
-            out[y, x] = padded[x] + padded[x + np.uint64(1)] + padded[x + np.uint64(2)] + padded[x + np.uint64(3)]
-    return out
-
-
-@kernel
 def changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift) -> Mask:  # type: ignore[no-untyped-def]
     """Cells that hold a pixel whose change exceeds the limit and what a shift by so many px would make."""
     side, scale = np.uint64(CELL_PX // 2), np.float32(1 / BOX_AREA)
@@ -90,17 +73,3 @@ def _mark_cells(pixels: Mask, cells: Mask) -> None:
     for column in range(np.uint64(cells.size)):
         for x in range(column * side, min((column + np.uint64(1)) * side, width)):
             cells[column] |= pixels[x]
-
-
-@kernel
-def any_kernel(half: Mask, out: Mask) -> None:
-    """Mark the cells (rows, columns) in which a mask at half the resolution holds anywhere."""
-    side = np.uint64(CELL_PX // 2)
-    height, width = np.uint64(half.shape[0]), np.uint64(half.shape[1])
-    found = np.empty(width, np.bool_)
-    for row in range(np.uint64(out.shape[0])):
-        found[:] = False
-        for y in range(row * side, min((row + np.uint64(1)) * side, height)):
-            for x in range(width):
-                found[x] |= half[y, x]
-        _mark_cells(found, out[row])

@@ -31,8 +31,6 @@ from velfield.detection.changes import (
     BOX_AREA,
     BOX_PX,
     CELL_PX,
-    any_kernel,
-    box_sums_kernel,
     changed_kernel,
     difference_kernel,
 )
@@ -57,6 +55,7 @@ _SHIFT_PX = 0.3
 every edge of a city that makes a change: without the allowance up to three quarters of a shaken frame were searched."""
 _SAMPLE_PX = CELL_PX
 """Distance of the pixels, at half the resolution, that noise is estimated from: one in two by two cells."""
+_BOX = (BOX_PX // 2, BOX_PX // 2)
 _REACH_CARS = 1.75
 """A detection is not kept where something changed so near, in car lengths: half of a long bus."""
 _UNSURE_FRACTION = 0.1
@@ -246,7 +245,7 @@ def changed_cells(frame: SearchableFrame, reference: SearchableFrame, slope: Flo
     one_only = np.zeros((rows, columns), bool)
     images, masks = (frame.half_image, reference.half_image), (frame.half_valid, reference.half_valid)
     difference = difference_kernel(*images, *masks, sums, counts, one_only)
-    boxes = box_sums_kernel(difference)
+    boxes = cv2.boxFilter(difference, cv2.CV_16S, _BOX, normalize=False, borderType=cv2.BORDER_REPLICATE)
     share = np.float32(1 / side**2)
     slow = _slow_part(sums * share, counts * share)
     sample = (slice(_SAMPLE_PX // 2, None, _SAMPLE_PX),) * 2
@@ -262,8 +261,7 @@ def changed_cells(frame: SearchableFrame, reference: SearchableFrame, slope: Flo
 
 def box_mean_slope(frame: SearchableFrame) -> Float32Array:
     """Steepness of a frame's mean over boxes of `BOX_PX`, grey levels a pixel of half the resolution."""
-    side = BOX_PX // 2
-    mean = cv2.boxFilter(frame.half_image, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
+    mean = cv2.boxFilter(frame.half_image, cv2.CV_32F, _BOX, borderType=cv2.BORDER_REPLICATE)
     along, across = (cv2.Sobel(mean, cv2.CV_32F, 1 - k, k, scale=1 / 8) for k in (0, 1))
     return np.asarray(cv2.magnitude(along, across, along), np.float32)
 
@@ -285,8 +283,7 @@ def _outside(detections: Detections, searched: Mask, half_valid: Mask) -> Detect
 
 def _cells_to_repeat(changed: Mask, detections: Detections, length_px: float) -> Mask:
     """Cells of the detections near which something changed, and of those of the lowest scores."""
-    reach = 2 * int(np.ceil(_REACH_CARS * length_px / CELL_PX)) + 1
-    near = cv2.dilate(changed.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+    near = _grow(changed, int(np.ceil(_REACH_CARS * length_px / CELL_PX)))
     repeat = np.zeros(changed.shape, bool)
     row, column = _locate_cells(detections.xy, changed.shape)
     repeat[row, column] = near[row, column]
@@ -303,6 +300,6 @@ def _locate_cells(xy: FloatArray, shape: tuple[int, ...]) -> tuple[IntArray, Int
 
 def _any_in_cells(half: Mask) -> Mask:
     """Whether a mask at half the resolution holds anywhere in each cell."""
-    out = np.zeros([-(-size // (CELL_PX // 2)) for size in half.shape], bool)
-    any_kernel(half, out)
-    return out
+    side = CELL_PX // 2
+    grown = cv2.dilate(half.view(np.uint8), np.ones((side, side), np.uint8), anchor=(0, 0))
+    return np.asarray(grown[::side, ::side] > 0)

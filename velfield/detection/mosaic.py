@@ -8,10 +8,10 @@ the network), or else one after another (`Detector.find_in_crops`); candidates i
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from schemas.arrays import ByteArray, FloatArray, IntArray
-from velfield.compiled import kernel
+from schemas.arrays import FloatArray, GreyImage, IntArray
 from velfield.detection.changes import CELL_PX
 from velfield.detection.frame import SearchableFrame
 from velfield.detection.interface import Detections, Detector, concatenate
@@ -46,8 +46,8 @@ def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
         return []
     sizes = _windows_px(boxes, context_px)[:, 2:]
     order = np.lexsort((sizes[:, 1], -sizes[:, 0]))
-    number, corners = shelve_kernel(sizes[order], _SIDE_PX)
-    crops = np.column_stack([corners, sizes[order]])
+    number, *corners = _shelve(sizes[order].tolist())
+    crops = np.column_stack([*corners, sizes[order]])
     ends = np.flatnonzero(np.diff(number)) + 1
     parts = zip(np.split(order, ends), np.split(crops, ends), strict=True)
     return [Mosaic((int((of[:, 0] + of[:, 2]).max()), int((of[:, 1] + of[:, 3]).max())), one, of) for one, of in parts]
@@ -62,21 +62,18 @@ def _windows_px(boxes: Sequence[Box], context_px: int) -> IntArray:
     return np.column_stack([first, last - first])
 
 
-@kernel
-def shelve_kernel(sizes: IntArray, side: int) -> tuple[IntArray, IntArray]:
-    """Number of the mosaic (n,) of crops of sizes (n, 2), height and width, the tallest first, and its corner there
-    (n, 2): row and column. A mosaic is no larger than a side, unless a crop is."""
-    number, corners = np.zeros(len(sizes), np.int64), np.zeros((len(sizes), 2), np.int64)
-    mosaic = y = x = shelf = 0
-    for k in range(len(sizes)):
-        height, width = sizes[k]
-        if x > 0 and x + width > side:
+def _shelve(sizes: list[list[int]]) -> IntArray:
+    """Number of the mosaic of each crop of sizes (height, width), the tallest first, and its row and column there:
+    (3, n). A mosaic is no larger than `_SIDE_PX`, unless a crop is."""
+    places, mosaic, y, x, shelf = [], 0, 0, 0, 0
+    for height, width in sizes:
+        if x > 0 and x + width > _SIDE_PX:
             y, x, shelf = y + shelf, 0, 0
-        if y > 0 and x == 0 and y + height > side:
+        if y > 0 and x == 0 and y + height > _SIDE_PX:
             mosaic, y = mosaic + 1, 0
-        number[k], corners[k, 0], corners[k, 1] = mosaic, y, x
+        places.append((mosaic, y, x))
         x, shelf = x + width, max(shelf, height)
-    return number, corners
+    return np.array(places).T
 
 
 def find_in_boxes(
@@ -112,70 +109,33 @@ def _find_in_mosaic(
     """The candidates of a mosaic, in px of the frame, and the number of the box of each."""
     placed, inner = mosaic.crops, np.array(boxes)[mosaic.numbers] * CELL_PX
     corners = _windows_px(boxes, detector.context_px)[mosaic.numbers, :2]
-    image = assemble_kernel(frame.image, corners, placed, *mosaic.shape, True)
-    valid = assemble_kernel(frame.valid.view(np.uint8), corners, placed, *mosaic.shape, False).view(np.bool_)
+    image = assemble(frame.image, corners, mosaic, cv2.BORDER_REFLECT_101)
+    valid = assemble(frame.valid.view(np.uint8), corners, mosaic, cv2.BORDER_CONSTANT).view(np.bool_)
     found = detector.find_in_crops(image, valid, placed, threshold=threshold)
     searched = np.column_stack([placed[:, :2] + inner[:, :2] - corners, inner[:, 2:] - inner[:, :2]])
-    crop = owners_kernel(np.ascontiguousarray(found.xy), searched, *mosaic.shape)
-    inside = np.flatnonzero(crop >= 0)
-    found, crop = found.take(inside), crop[inside]
-    shift = (corners - placed[:, :2])[crop]
-    cars = found.to_rows()
-    cars[:, :2] += shift[:, ::-1]
+    candidate, crop = find_owners(found.xy, searched, mosaic.shape)
+    cars = found.take(candidate).to_rows()
+    cars[:, :2] += (corners - placed[:, :2])[crop, ::-1]
     return Detections.from_all(cars), mosaic.numbers[crop]
 
 
-@kernel
-def owners_kernel(xy: FloatArray, boxes: IntArray, height: int, width: int) -> IntArray:
-    """Number of the box (n, 4) of a mosaic in which the pixel of each position (n, 2) lies; -1 where in none."""
-    out = np.full(len(xy), -1, np.int64)
-    for n in range(len(xy)):
-        x = min(max(int(np.floor(xy[n, 0] + 0.5)), 0), width - 1)
-        y = min(max(int(np.floor(xy[n, 1] + 0.5)), 0), height - 1)
-        for k in range(len(boxes)):
-            top, left, rows, columns = boxes[k]
-            if top <= y < top + rows and left <= x < left + columns:
-                out[n] = k
+def find_owners(xy: FloatArray, boxes: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray]:
+    """Which of the positions (n, 2) lie by their pixels in disjoint boxes (m, 4) of a mosaic, and in which."""
+    y, x = (np.clip(np.floor(xy[:, 1 - k] + 0.5), 0, shape[k] - 1)[:, None] for k in (0, 1))
+    top, left, rows, columns = boxes.T
+    inside = (top <= y) & (y < top + rows) & (left <= x) & (x < left + columns)
+    position, box = np.nonzero(inside)
+    return position, box
+
+
+def assemble(image: GreyImage, corners: IntArray, mosaic: Mosaic, border: int) -> GreyImage:
+    """A mosaic of the windows of an image with these corners (n, 2); beyond the image they go on as OpenCV's border."""
+    out, (height, width) = np.zeros(mosaic.shape, np.uint8), image.shape
+    for (row, column, rows, columns), (top, left) in zip(mosaic.crops.tolist(), corners.tolist(), strict=True):
+        bottom, right = top + rows, left + columns
+        window = image[max(top, 0) : bottom, max(left, 0) : right]
+        if window.shape != (rows, columns):
+            beyond = max(-top, 0), max(bottom - height, 0), max(-left, 0), max(right - width, 0)
+            window = cv2.copyMakeBorder(window, *beyond, border)
+        out[row : row + rows, column : column + columns] = window
     return out
-
-
-@kernel
-def assemble_kernel(
-    image: ByteArray, corners: IntArray, crops: IntArray, height: int, width: int, reflected: bool
-) -> ByteArray:
-    """A mosaic (height, width) of the windows of an image with these corners (n, 2), where crops (n, 4) lie.
-
-    Beyond the image a window is zero, or what of it lies inside goes on by reflection (OpenCV's BORDER_REFLECT_101).
-    """
-    out = np.zeros((height, width), np.uint8)
-    for n in range(len(crops)):
-        row, column, rows, columns = crops[n]
-        top, left = corners[n]
-        first_row, first_column = max(0, -top), max(0, -left)
-        inner_rows = min(rows, image.shape[0] - top) - first_row
-        inner_columns = min(columns, image.shape[1] - left) - first_column
-        whole = inner_rows == rows and inner_columns == columns
-        for y in range(rows):
-            inside = 0 <= y - first_row < inner_rows
-            if not inside and not reflected:
-                continue
-            source = image[top + first_row + _reflect(y - first_row, inner_rows)]
-            target = out[row + y, column : column + columns]
-            shift, begin = left + first_column, np.uint64(first_column)
-            # By a loop: numba assigns slices byte by byte, at seven times the cost.
-            for x in range(np.uint64(inner_columns)):
-                target[begin + x] = source[np.uint64(shift) + x]
-            if reflected and not whole:
-                for x in range(first_column):
-                    target[x] = source[shift + _reflect(x - first_column, inner_columns)]
-                for x in range(first_column + inner_columns, columns):
-                    target[x] = source[shift + _reflect(x - first_column, inner_columns)]
-    return out
-
-
-@kernel
-def _reflect(place: int, count: int) -> int:
-    """The place among so many that one beyond them is the mirror image of, about the first or the last."""
-    while not 0 <= place < count:
-        place = 0 if count == 1 else -place if place < 0 else 2 * count - 2 - place
-    return place
