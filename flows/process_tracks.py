@@ -10,8 +10,7 @@ from flows.stopping import stop_lost
 from flows.work import Work
 from schemas.job import Job, absolute
 from schemas.summary import RunSummary
-from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
-from velfield.pipeline.graphs import tracks_graph
+from velfield.pipeline.given_tracks.plan import plan_tracks
 from velfield.pipeline.plan import check_folder
 from velfield.run.commits import sweep_partial
 from velfield.run.layout import RunLayout
@@ -39,7 +38,7 @@ def process_tracks(job: Job, runner: RunnerConfig, console: Console, by: Orchest
         sweep_partial(layout.root)
         record_start(plan, f"tracks over {plan.frame_count} times, {where.description}", console)
         work = Work(plan, where, console, by, at_once=parallel_units(runner))
-        work.run(list_track_stages(), tracks_graph, essential=True)
+        work.run()
         summary = RunSummary(root=job.root, stages=tuple(work.summaries))
         publish_report(work.plan, summary, where, console, by)
     return summary

@@ -6,7 +6,6 @@ again.
 """
 
 from concurrent.futures import Future
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,11 @@ from flows.prefect_server import choose_orchestration
 from flows.process_flight import process_flight, publish_report
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stopping import stop_lost
-from flows.work import Work
+from flows.work import Mapped, Work
 from schemas.job import Inputs, Job, absolute
 from schemas.records import RebaseRecord
 from schemas.summary import RunSummary
 from velfield.errors import Failure, InputError
-from velfield.pipeline.given_tracks.plan import TRACKS
-from velfield.pipeline.graphs import rebase_graph
 from velfield.pipeline.plan import write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, NewBase, stages_before
 from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
@@ -108,7 +105,7 @@ def reprocess(
 def _new_job(run: Run, name: str, base: str) -> Job:
     if run.layout.rebased.exists():
         raise InputError(f"{run.layout.root} is itself mapped onto a new base image; reprocess the original run")
-    if run.record.inputs.source.kind == TRACKS:
+    if run.record.inputs.source.of_tracks:
         raise InputError(
             f"{run.layout.root} was made from tracks and has no frames; run `velfield run --tracks` with the new --base"
         )
@@ -167,8 +164,9 @@ def _mapped(
     plan = plan_rebase(run, job, found)
     write_flight_record(plan)
     with open_runner(runner, console.warn) as where:
-        work = Work(plan, where, console, by, at_once=parallel_units(runner))
-        _run_stages(work, Rebase(run.layout, found), measured)
+        mapped = Mapped(Rebase(run.layout, found), measured)
+        work = Work(plan, where, console, by, at_once=parallel_units(runner), mapped=mapped)
+        work.run()
         summary = summarise_run(plan, work.summaries)
         publish_report(plan, summary, where, console, by)
     return summary
@@ -176,13 +174,3 @@ def _mapped(
 
 def _names(new_base: NewBase) -> list[str]:
     return [stage.name for stage in STAGES if stage.new_base is new_base]
-
-
-def _run_stages(work: Work, rebase: Rebase, measured: "Future[Any]") -> None:
-    graph = partial(rebase_graph, rebase=rebase)
-    for stage in STAGES:
-        if stage.new_base in (NewBase.SHARED, NewBase.COUNTS):
-            work.carry_over(stage)
-        else:
-            reads = [measured] if stage.new_base is NewBase.MAPPED else []
-            work.run([stage], graph, essential=True, after=reads)

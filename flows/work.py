@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from flows.console import Console, StageProgress
 from flows.orchestration import Orchestration
@@ -16,13 +16,14 @@ from velfield.errors import InputError, is_disk_full
 from velfield.pipeline.graphs import unit_graph
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
-from velfield.pipeline.stage import STAGE, STAGES, Cut, Stage
+from velfield.pipeline.stage import STAGE, STAGES, Cut, NewBase, Stage
 from velfield.pipeline.summary import summarise_stage
 from velfield.pipeline.units import Unit, discard_unit, prepare_stage, stage_units
 from velfield.run.commits import WHOLE, read_commits
 
-GraphOf = Callable[[Plan, Stage, Unit], Any]
-"""The Dask graph of a unit."""
+if TYPE_CHECKING:
+    from velfield.pipeline.stages.rebase import Rebase
+
 _QUEUED = 1
 """Units submitted beyond those that run, so that a thread that is done finds the next one."""
 
@@ -36,7 +37,6 @@ class UnderWay:
     units: list[Unit]
     records: list[CommitRecord | None]
     """What an earlier run wrote of each, without its outputs; None: it is to be computed."""
-    essential: bool
     progress: StageProgress
     show: Callable[[int], None]
     """Called with the steps that are done."""
@@ -61,11 +61,19 @@ class Aside(Protocol):
         """Called before a stage writes anything."""
 
 
+@dataclass(frozen=True)
+class Mapped:
+    """A finished run that is mapped onto a new base image, and the task that registered the image."""
+
+    rebase: "Rebase"
+    measured: Future[Any]
+
+
 @dataclass
 class Work:
     """Computes stages of one plan; ``plan`` changes its keys when units fail.
 
-    ``at_once``: units that the task runner runs at a time.
+    ``at_once``: units that the task runner runs at a time. ``mapped``: of a run that is mapped onto a new base image.
     """
 
     plan: Plan
@@ -74,6 +82,7 @@ class Work:
     orchestration: Orchestration
     at_once: int = 2
     aside: Aside | None = None
+    mapped: Mapped | None = None
     summaries: list[StageSummary] = field(default_factory=list)
     _stages: dict[str, UnderWay] = field(default_factory=dict)
     _running: int = 0
@@ -83,36 +92,25 @@ class Work:
     def __post_init__(self) -> None:
         self._given = self.plan
 
-    def run(
-        self,
-        stages: Sequence[Stage] = STAGES,
-        graph: GraphOf = unit_graph,
-        *,
-        essential: bool | None = None,
-        after: Sequence[Future[Any]] = (),
-    ) -> None:
-        """Compute all units of some stages, stage by stage in the order of the table.
+    def run(self) -> None:
+        """Compute all units of the plan's stages, stage by stage in the order of the table.
 
         A unit that fails is lost, and with it the same unit of the stages that read it; all others go on with what is
         there. Where an error ends the run, it is raised when nothing writes into the run folder any more.
-
-        Parameters
-        ----------
-        graph
-            The Dask graph of a unit.
-        essential
-            Nothing can follow without these stages: their failure is the run's. Default: as the table says.
-        after
-            Tasks that have ended, whose results every unit reads besides those of the stages before it.
         """
         with self.console.stages() as bars:
             try:
-                for stage in stages:
+                for stage in STAGES:
+                    if stage.name not in self.plan.keys:
+                        continue
+                    if self.mapped and stage.new_base in (NewBase.SHARED, NewBase.COUNTS):
+                        self._carry_over(stage)
+                        continue
                     if self._beside is None:
                         self._restart_before(stage)
                     steps = "frames" if stage.cut is Cut.BY_FRAMES else "steps"
                     progress = bars.add(stage.name, stage.label, steps)
-                    self._compute(self._start(stage, progress, essential), graph, after)
+                    self._compute(self._start(stage, progress))
             except BaseException:
                 self.console.print_warnings()
                 raise
@@ -122,13 +120,13 @@ class Work:
                 while self._running or self._beside is not None:
                     self._next_end()
 
-    def _compute(self, under_way: UnderWay, graph: GraphOf, after: Sequence[Future[Any]]) -> None:
+    def _compute(self, under_way: UnderWay) -> None:
         """Compute the units of a stage: no more of them are submitted than run at once, and a few."""
         left = [k for k in range(len(under_way.units)) if k not in under_way.ended]
         while left or self._running:
             self._submit_aside()
             while left and self._running < self.at_once + _QUEUED - (self._beside is not None):
-                self._submit(under_way, left.pop(0), graph, after)
+                self._submit(under_way, left.pop(0))
             k = self._next_end()
             if k is not None:
                 self._end(under_way, k)
@@ -153,7 +151,7 @@ class Work:
         if any(committed(self.plan, stage.name, unit.name) is None for unit in units):
             self.runner.restart_workers()
 
-    def _start(self, stage: Stage, progress: StageProgress, essential: bool | None) -> UnderWay:
+    def _start(self, stage: Stage, progress: StageProgress) -> UnderWay:
         if self.aside is not None:
             self.aside.before(stage.name)
         prepare_stage(self.plan, stage)
@@ -163,9 +161,8 @@ class Work:
         found = (committed(self.plan, stage.name, unit.name) for unit in units)
         records = [None if record is None else _without_outputs(record) for record in found]
         progress.at_least(sum(unit.steps for unit, record in zip(units, records, strict=True) if record))
-        whole = stage.essential if essential is None else essential
         show = self.orchestration.show_progress(stage.name, total)
-        under_way = UnderWay(stage, self.plan, units, records, whole, progress, show, time.monotonic())
+        under_way = UnderWay(stage, self.plan, units, records, progress, show, time.monotonic())
         self._stages[stage.name] = under_way
         for k, unit in enumerate(units):
             if gone := [name for name in self._alike(stage) if unit.name in self._stages[name].lost]:
@@ -184,6 +181,8 @@ class Work:
     def _upstream(self, under_way: UnderWay, k: int) -> list[Future[Any]]:
         """Futures of the units that a unit reads, for the lineage: of what is not lost."""
         found: list[Future[Any]] = []
+        if self.mapped and under_way.stage.new_base is NewBase.MAPPED:
+            found.append(self.mapped.measured)
         for name in under_way.stage.after:
             before = self._stages.get(name)
             if before is not None and name in self._alike(under_way.stage):
@@ -192,22 +191,23 @@ class Work:
                 found += before.futures.values()
         return [future for future in found if future.exception() is None]
 
-    def carry_over(self, stage: Stage) -> None:
+    def _carry_over(self, stage: Stage) -> None:
         """Summarise a stage whose units an earlier result finished, and that this one takes as they are."""
         records = read_commits(self.plan.layout, stage.name)
         summary = summarise_stage(stage.name, records, units=len(records), before=records, seconds=0.0)
         self.summaries.append(summary)
 
-    def _submit(self, under_way: UnderWay, k: int, graph: GraphOf, after: Sequence[Future[Any]]) -> None:
+    def _submit(self, under_way: UnderWay, k: int) -> None:
         plan, stage, unit = under_way.plan, under_way.stage, under_way.units[k]
         record, failed = under_way.records[k], ""
+        rebase = self.mapped.rebase if self.mapped else None
 
         def do() -> CommitRecord:
             nonlocal failed
             if failed:
                 self.console.warn(f"{self._describe(under_way, unit)} failed: {failed}; trying again")
             try:
-                return record or _without_outputs(self.runner.compute(graph(plan, stage, unit)))
+                return record or _without_outputs(self.runner.compute(unit_graph(plan, stage, unit, rebase)))
             except Exception as error:
                 failed = _reason(error)
                 raise
@@ -218,7 +218,7 @@ class Work:
             name=stage.label,
             run_name=label,
             retries=self.plan.config.work.retries,
-            after=[*after, *self._upstream(under_way, k)],
+            after=self._upstream(under_way, k),
         )
         under_way.futures[k] = future
         self._running += 1
@@ -237,7 +237,7 @@ class Work:
         under_way.ended.add(k)
         future, unit = under_way.futures[k], under_way.units[k]
         if (error := future.exception()) is not None:
-            if isinstance(error, InputError) or is_disk_full(error) or under_way.essential:
+            if isinstance(error, InputError) or is_disk_full(error) or self.mapped or under_way.stage.essential:
                 raise error
             under_way.lost[unit.name] = f"{self._describe(under_way, unit)} failed: {_reason(error)}; re-run to retry"
             self.console.warn(under_way.lost[unit.name])

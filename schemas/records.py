@@ -48,6 +48,11 @@ class SourceRecord(Model):
     height: PositiveInt
     frame_count: NonNegativeInt
 
+    @property
+    def of_tracks(self) -> bool:
+        """Whether it is a file of tracks (`velfield run --tracks`), which has no frames."""
+        return self.kind == "tracks"
+
 
 class InputsRecord(Model):
     """Digests of what the user gave; ``None`` where nothing was given."""

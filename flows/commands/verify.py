@@ -58,7 +58,7 @@ def _repair(run: "Run") -> None:
     from schemas.job import Job
     from velfield.analysis.movements.time_slices import SLICE_S
     from velfield.pipeline.analysis.analyse import analyse_run
-    from velfield.pipeline.given_tracks.plan import TRACKS, plan_tracks
+    from velfield.pipeline.given_tracks.plan import plan_tracks
     from velfield.pipeline.plan import make_plan
     from velfield.pipeline.verify import invalidate, verify_run
     from velfield.run.commits import ANALYSIS, read_commit
@@ -68,7 +68,7 @@ def _repair(run: "Run") -> None:
     check_format(run.layout.root)
     given = _inputs(run.record, run.layout.root)
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
-    of_tracks = run.record.inputs.source.kind == TRACKS
+    of_tracks = run.record.inputs.source.of_tracks
     plan = (plan_tracks if of_tracks else make_plan)(job)
     # Where the inputs changed since, it would be another run and not a repair.
     if plan.keys != run.record.keys:

@@ -20,9 +20,8 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.exports.export import export_run
 from velfield.pipeline.given_tracks.load import load_tracks
-from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
+from velfield.pipeline.given_tracks.plan import plan_tracks
 from velfield.pipeline.given_tracks.write import at_frames
-from velfield.pipeline.graphs import tracks_graph
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import write_flight_record
 from velfield.pipeline.verify import verify_run
@@ -83,7 +82,7 @@ def process(path: Path, out: Path, **settings: float | str) -> Run:
     config = FlightConfig.model_validate(settings)
     plan = plan_tracks(Job(root=str(out), inputs=Inputs(source=str(path)), config=config))
     write_flight_record(plan)
-    compute_stages(plan, [stage.name for stage in list_track_stages()], graph=tracks_graph)
+    compute_stages(plan)
     return open_run(out)
 
 

@@ -16,8 +16,7 @@ from schemas.scale import CAR_LENGTH_M
 from schemas.simulation import SimulationConfig
 from velfield.pipeline.analysis.analyse import analyse_run
 from velfield.pipeline.configuration import resolve_config
-from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
-from velfield.pipeline.graphs import tracks_graph
+from velfield.pipeline.given_tracks.plan import plan_tracks
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.synthetic.write import write_flight
@@ -45,7 +44,7 @@ def _process_tracks(folder: Path) -> None:
     _crossing_streets().to_csv(tracks, index=False)
     plan = plan_tracks(Job(root=str(run), inputs=Inputs(source=str(tracks)), config=FlightConfig()))
     write_flight_record(plan)
-    compute_stages(plan, [stage.name for stage in list_track_stages()], graph=tracks_graph)
+    compute_stages(plan)
     for _ in analyse_run(run):
         pass
 

@@ -34,39 +34,29 @@ def _constant(value: Any) -> Any:
     return delayed(value, pure=False, traverse=False)
 
 
-def unit_graph(plan: Plan, stage: Stage, unit: Unit) -> Graph:
-    """A unit of a stage: its blocks where it has any, then its result, then its commit record."""
+def unit_graph(plan: Plan, stage: Stage, unit: Unit, rebase: "Rebase | None" = None) -> Graph:
+    """A unit of a stage: its blocks where it has any, then its result, then its commit record.
+
+    Of given tracks, and of a run that is mapped onto a new base image (``rebase``), the stage's own function for them
+    where it has one.
+    """
     constant = _constant(plan)
-    blocks = []
-    if stage.block is not None:
+    function, arguments = stage.unit, list(unit.part)
+    if rebase is not None and stage.remap is not None:
+        function, arguments = stage.remap, [*arguments, _constant(rebase)]
+    elif plan.inputs.source.of_tracks and stage.from_tracks is not None:
+        function = stage.from_tracks
+    elif stage.block is not None:
         block, parts = resolve(stage.block), unit_blocks(plan, unit)
         # Dask computes what is alike in the order of its keys, which it would draw at random: the last block, a short
         # one, may so come first, and a long one be left over for one thread alone.
         keys = [f"{stage.name}-{unit.name}-{k:06d}-{uuid4().hex}" for k in range(len(parts))]
-        blocks = [[_node(block, constant, frames, dask_key_name=key) for frames, key in zip(parts, keys, strict=True)]]
-    return _committed(constant, stage, unit, _node(resolve(stage.unit), constant, *unit.part, *blocks))
+        blocks = [_node(block, constant, frames, dask_key_name=key) for frames, key in zip(parts, keys, strict=True)]
+        arguments.append(blocks)
+    result = _node(resolve(function), constant, *arguments)
+    return _node(commit, constant, stage.name, unit.name, result, started=time.time())
 
 
 def compute_here(graph: Graph) -> Any:
     """The value of a graph, computed on this thread."""
     return graph.compute(scheduler=get_sync)
-
-
-def rebase_graph(plan: Plan, stage: Stage, unit: Unit, rebase: "Rebase") -> Graph:
-    """A unit of a run that is mapped onto a new base image, where the stage has a map; else as in any run."""
-    if stage.remap is None:
-        return unit_graph(plan, stage, unit)
-    constant = _constant(plan)
-    return _committed(constant, stage, unit, _node(resolve(stage.remap), constant, *unit.part, _constant(rebase)))
-
-
-def tracks_graph(plan: Plan, stage: Stage, unit: Unit) -> Graph:
-    """A unit of a run of given tracks, which has no frames."""
-    if stage.from_tracks is None:
-        return unit_graph(plan, stage, unit)
-    constant = _constant(plan)
-    return _committed(constant, stage, unit, _node(resolve(stage.from_tracks), constant, *unit.part))
-
-
-def _committed(plan: Any, stage: Stage, unit: Unit, result: Any) -> Graph:
-    return _node(commit, plan, stage.name, unit.name, result, started=time.time())

@@ -118,7 +118,7 @@ class Run:
     @property
     def has_frames(self) -> bool:
         """Whether it was made of frames; False of tracks of another program, and of merged fields."""
-        return self.record.inputs.source.kind != "tracks" and self.layout.frames.exists()
+        return not self.record.inputs.source.of_tracks and self.layout.frames.exists()
 
     @property
     def times_s(self) -> FloatArray:

@@ -10,18 +10,9 @@ from velfield.errors import InputError
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.pipeline.given_tracks.write import frame_times
 from velfield.pipeline.plan import Plan, check_same_flight
-from velfield.pipeline.stage import STAGES, Stage, stage_keys
+from velfield.pipeline.stage import STAGES, stage_keys
 from velfield.run.commits import digest_path
 from velfield.sources.frames import SourceInfo
-
-TRACKS = "tracks"
-"""Kind of the source of such a run."""
-
-
-def list_track_stages() -> list[Stage]:
-    """The stages of such a run: those that given tracks have a function for, and those after."""
-    first = next(k for k, stage in enumerate(STAGES) if stage.from_tracks)
-    return [stage for stage in STAGES[first:] if stage.from_tracks or stage.name != "scale"]
 
 
 def describe_tracks(job: Job) -> str:
@@ -36,7 +27,7 @@ def describe_tracks(job: Job) -> str:
     span = float(plan.info.times_s[-1] - plan.info.times_s[0])
     return (
         f"{job.inputs.source}: tracks over {span:.1f} s at {plan.frame_count} times, on a map of {plan.info.width} x "
-        f"{plan.info.height} px of {plan.config.gsd_m:g} m: {', '.join(stage.name for stage in list_track_stages())}"
+        f"{plan.info.height} px of {plan.config.gsd_m:g} m: {', '.join(plan.keys)}"
     )
 
 
@@ -63,7 +54,7 @@ def plan_tracks(job: Job) -> Plan:
         raise InputError(f"{path}: found {len(times_s)} times, expected 3 or more for a velocity; give longer tracks")
     source = SourceRecord(
         path=str(path),
-        kind=TRACKS,
+        kind="tracks",
         digest=" ".join((digest_path(path), job.config.position_unit or "", job.config.position_y_axis or "")).strip(),
         width=width,
         height=height,
@@ -72,12 +63,14 @@ def plan_tracks(job: Job) -> Plan:
     inputs = InputsRecord(source=source, base=digest_path(base) if base else None)
     info = SourceInfo("folder", width, height, len(times_s), times_s, ())
     keys = stage_keys(job.config, inputs)
+    first = next(k for k, stage in enumerate(STAGES) if stage.from_tracks)
+    done = [stage.name for stage in STAGES[first:] if stage.name != "scale"]
     plan = Plan(
         job=job.model_copy(update={"config": job.config.model_copy(update={"gsd_m": given.gsd_m})}),
         info=info,
         indices=np.arange(len(times_s)),
         inputs=inputs,
-        keys={stage.name: keys[stage.name] for stage in list_track_stages()},  # of the others `verify` asks nothing
+        keys={name: keys[name] for name in done},  # of the others `verify` asks nothing
     )
     _ = plan.time_intervals  # refuses impossible intervals now
     check_same_flight(plan)

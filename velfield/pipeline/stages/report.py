@@ -165,7 +165,7 @@ def _inputs(plan: Plan) -> list[tuple[str, str]]:
         (
             "base image",
             plan.job.inputs.base
-            or ("built from the flight" if plan.inputs.source.kind != "tracks" else "the tracks, drawn"),
+            or ("built from the flight" if not plan.inputs.source.of_tracks else "the tracks, drawn"),
         ),
         ("ground sample distance", gsd),
         ("training data", _TRAINING_SOURCES[working.training_source]),
