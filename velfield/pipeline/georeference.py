@@ -32,7 +32,7 @@ from velfield.pipeline.stages.georeference import (
 from velfield.pipeline.stages.rebase import describe_source
 from velfield.pipeline.stages.report import write_report
 from velfield.pipeline.summary import summarise_run, summarise_stage
-from velfield.run.commits import WHOLE, read_commits, remove_analysis, write_atomically
+from velfield.run.commits import WHOLE, read_commits, remove_analysis, write_record
 from velfield.run.flight_record import check_format
 from velfield.run.frame_transforms import read_first_georeference, read_georeference
 from velfield.run.layout import RunLayout, remove_tree, to_path
@@ -105,7 +105,7 @@ def georeference(
     fitted = fit_run_points(run, points, epsg, model)
     with locked(run.layout):
         before_m, plan = run.grid.gsd_m, plan_of_finished(run)
-        write_atomically(run.layout.control_points, fitted.model_dump_json(indent=1).encode())
+        write_record(run.layout.control_points, fitted)
         first = _record(read_first_georeference(run.layout) or GeoreferenceRecord(), fitted)
         record = _record(read_georeference(run.layout) or GeoreferenceRecord(), fitted)
         for stage, path, written in (

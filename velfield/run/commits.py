@@ -108,6 +108,11 @@ def write_atomically(path: Path, data: bytes, *, sync: bool = True) -> None:
         file.write(data)
 
 
+def write_record(path: Path, record: BaseModel, *, indent: int | None = 1) -> None:
+    """Write a record as JSON, atomically."""
+    write_atomically(path, record.model_dump_json(indent=indent).encode())
+
+
 @contextmanager
 def open_atomically(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
     """A file to write, which takes the place of ``path`` once it is complete.

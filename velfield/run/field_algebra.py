@@ -9,7 +9,7 @@ from velfield.field.accumulate import FieldTile
 from velfield.field.algebra import merge_tiles, subtract_tile
 from velfield.field.segments import VelocityBins
 from velfield.field.view import TileSource
-from velfield.run.commits import content_key, digest_file, digest_outputs, write_atomically
+from velfield.run.commits import content_key, digest_file, digest_outputs, write_record
 from velfield.run.field_reader import tile_reader
 from velfield.run.field_writer import GroupWriter, create_field_store, tile_groups
 from velfield.run.flight_record import read_flight_record
@@ -126,9 +126,9 @@ def _write(
     config = record.config.field
     out.mkdir(parents=True, exist_ok=True)
     shutil.copytree(first.base, layout.base, ignore=shutil.ignore_patterns(first.grid.name, first.working.name))
-    write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
+    write_record(layout.grid, grid)
     if first.working.exists():
-        write_atomically(layout.working, read_working(first).model_dump_json(indent=1).encode())
+        write_record(layout.working, read_working(first))
     key = content_key("algebra", 1, parameters=list(made_from), inputs=[store_key(store.path) for store in stores])
     create_field_store(
         layout.field,
@@ -147,7 +147,7 @@ def _write(
     for group in tile_groups(grid, config):
         files |= _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins, zeros=[]), kinds, combine)
     digest_outputs(layout, files)  # which sees to it that they are on the disk
-    write_atomically(layout.flight, record.model_dump_json(indent=1).encode())  # last: without it nothing is whole
+    write_record(layout.flight, record)  # last: without it nothing is whole
 
 
 def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileSource]], combine: Combine) -> set[Path]:

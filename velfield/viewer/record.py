@@ -25,7 +25,7 @@ from velfield.analysis.vehicle_classes import CLASS_NAMES
 from velfield.analysis.vehicles import STATES, count_states
 from velfield.field.segments import Segments, band_radius_px, stationary_speed_px_per_s
 from velfield.field.statistics import PERCENTILES
-from velfield.run.commits import record_page, write_atomically
+from velfield.run.commits import record_page, write_atomically, write_record
 from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.run import Run, open_run
@@ -102,7 +102,7 @@ def write_view_record(layout: RunLayout) -> None:
     if layout.view_changes.exists():
         stores["view/change.zarr"] = FieldStore(layout.view_changes)
     record = view_record(run.record, run.grid, stores, read_segment_tracks(layout.view_segments), run.times_s)
-    write_atomically(layout.view_record, record.model_dump_json().encode())
+    write_record(layout.view_record, record, indent=None)
 
 
 def write_change_layers(layout: RunLayout, layers: Mapping[str, tuple[FloatArray, Mapping[str, str]]]) -> None:

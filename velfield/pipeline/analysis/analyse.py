@@ -27,7 +27,7 @@ from velfield.pipeline.given_tracks.load import SIZE_SD_M, load_tracks
 from velfield.report.traffic.diagrams import traffic_diagrams
 from velfield.report.traffic.first_page import first_page
 from velfield.report.traffic.report import report_html, report_pdf
-from velfield.run.commits import code_version, read_commits, record_analysis, write_atomically
+from velfield.run.commits import code_version, read_commits, record_analysis, write_atomically, write_record
 from velfield.run.flight_record import read_flight_record, source_name
 from velfield.run.frame_transforms import read_georeference
 from velfield.run.layout import RunLayout, remove_tree, to_path
@@ -197,7 +197,7 @@ def write_analysis(
     _check_names(analysis)
     gsd_m = analysis.trajectories.gsd_m
     lanes = lanes_record(analysis, speed_unit)
-    write_atomically(out / "lanes.json", lanes.model_dump_json().encode())
+    write_record(out / "lanes.json", lanes, indent=None)
     write_atomically(out / "lanes.geojson", lanes_geojson(lanes, georeference).encode())
     clips = dict(unusual_clips(analysis, frames)) if frames else {}
     remove_tree(out / "clips")  # of an earlier analysis
@@ -219,7 +219,7 @@ def write_analysis(
             _with_clips(_explain_empty(table, analysis), clips) for table in all_tables(analysis, unit=speed_unit)
         ),
     )
-    write_atomically(out / "analysis.json", record.model_dump_json().encode())
+    write_record(out / "analysis.json", record, indent=None)
     yield from answer_lines(analysis, unit=speed_unit)
     diagrams = list(traffic_diagrams(analysis, picture, unit=speed_unit))
     write_atomically(out / "report.html", report_html(record, page, diagrams, clips).encode())

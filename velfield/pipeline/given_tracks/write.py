@@ -23,7 +23,7 @@ from velfield.pipeline.stage import STAGE, stages_before
 from velfield.pipeline.stages.base_image import write_given_image
 from velfield.pipeline.stages.frames import create_frame_store
 from velfield.pipeline.stages.registration import create_registration_store
-from velfield.run.commits import POSITION_SD_M, write_atomically
+from velfield.run.commits import POSITION_SD_M, write_atomically, write_record
 from velfield.run.layout import RunLayout
 from velfield.run.stores import FrameStore
 from velfield.run.tables import conform, empty_table, write_table, write_tracks
@@ -169,7 +169,7 @@ def _write_base(layout: RunLayout, given: LoadedTracks, positions: pd.DataFrame)
     )
     working = WorkingRecord(scale=1.0, training_source="tracks", vehicle_gsd_m=given.gsd_m)
     for path, record in ((layout.grid, grid), (layout.working, working)):
-        write_atomically(path, record.model_dump_json(indent=1).encode())
+        write_record(path, record)
         written.append(path)
     return written
 

@@ -30,7 +30,7 @@ from velfield.registration.intersensor.register import IntersensorResult, regist
 from velfield.registration.intrasensor import prepare_base
 from velfield.registration.own_base import DetectKeypoints, OwnBase, build_own_base
 from velfield.report.figures import png_bytes
-from velfield.run.commits import write_atomically
+from velfield.run.commits import write_atomically, write_record
 from velfield.run.frame_transforms import base_mesh_to_record, read_lens
 from velfield.run.layout import RunLayout
 from velfield.run.stores import FrameStore
@@ -165,7 +165,7 @@ def _finish(
     layout.rebased.unlink(missing_ok=True)
     for later in (layout.georeference, layout.scale):  # of stages that follow
         later.unlink(missing_ok=True)
-    write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
+    write_record(layout.grid, grid)
     outputs.append(layout.grid)
     advance("base")
     counts = {"width": float(grid.width_px), "height": float(grid.height_px)}
@@ -231,7 +231,7 @@ def _register_to_given(plan: Plan, own: OwnBase, given: BaseRaster) -> tuple[Bas
         name = plan.job.inputs.base
         raise InputError(f"--base {name}: the flight's own base image could not be registered to it: {result.reason}")
     mesh = fit_base_mesh(own.image, own.valid, given.grey, result.transform.polyprojective, plan.config.base)
-    write_atomically(layout.own_to_base, base_mesh_to_record(mesh).model_dump_json(indent=1).encode())
+    write_record(layout.own_to_base, base_mesh_to_record(mesh))
     write_atomically(layout.base_error_map, png_bytes(_draw_error_map(result)))
     written = [layout.own_to_base, layout.base_error_map, *write_given_image(plan.layout, given)]
     fit = BaseFit(

@@ -32,7 +32,7 @@ from velfield.pipeline.stages.labels import (
 )
 from velfield.pipeline.stages.rectified_frames import WorkingGrid
 from velfield.pipeline.stages.registration import external_boxes, spread_usable_frames
-from velfield.run.commits import write_atomically
+from velfield.run.commits import write_atomically, write_record
 from velfield.run.frame_transforms import read_first_grid
 from velfield.run.stores import FrameStore
 
@@ -213,7 +213,7 @@ def _finish(
         training_source=training_source,
         labels=count,
     )
-    write_atomically(layout.working, record.model_dump_json(indent=1).encode())
+    write_record(layout.working, record)
     advance("detector")
     counts = {"labels": float(count), "working_scale": record.scale}
     if detector is not None:

@@ -20,7 +20,7 @@ from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_frac
 from velfield.registration.frame_fit import BaseReference, FrameRegistration
 from velfield.registration.intrasensor import prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints
-from velfield.run.commits import write_atomically
+from velfield.run.commits import write_record
 from velfield.run.stores import FrameStore
 from velfield.sources.geo import BaseRaster
 
@@ -110,7 +110,7 @@ def _refine_by_one(
 
 def accept_lens(plan: Plan, lens: PolynomialLens, evidence: str) -> list[str]:
     """Write a lens that matches with the given image decide for to ``base/lens.json``; a note on it."""
-    write_atomically(plan.layout.map_lens, lens.to_record().model_dump_json(indent=1).encode())
+    write_record(plan.layout.map_lens, lens.to_record())
     first, second = lens.coefficients
     return [f"lens by the base image: k = {first:.3f}, {second:.3f} from {evidence}"]
 

@@ -20,7 +20,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.labels import base_px_per_raw_px
 from velfield.registration.transforms import FrameMap
-from velfield.run.commits import digest_bytes, write_atomically
+from velfield.run.commits import digest_bytes, write_record
 from velfield.run.frame_transforms import (
     FrameTransforms,
     georeference_update,
@@ -276,7 +276,7 @@ def write_georeference(layout: RunLayout, path: Path, record: GeoreferenceRecord
         if record.crs_wkt is not None and record.affine is not None:
             outputs.append(layout.base_image_tif)
             write_cog(outputs[-1], [grey], names=["grey"], units=["1"], crs_wkt=record.crs_wkt, affine=record.affine)
-    write_atomically(path, record.model_dump_json(indent=1).encode())
+    write_record(path, record)
     return outputs
 
 

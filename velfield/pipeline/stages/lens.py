@@ -13,7 +13,7 @@ from velfield.camera.tilt import tilt_of_frames
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.pairing import match_frame_pairs
-from velfield.run.commits import write_atomically
+from velfield.run.commits import write_record
 from velfield.run.stores import FrameStore
 from velfield.sources.quality import UNUSABLE
 
@@ -45,7 +45,7 @@ def calibrate_flight(plan: Plan) -> StageResult:
         if pairs is not None:
             record = refine_lens(record, pairs.result())
         record = record.model_copy(update={"tilt": _tilt(images[:_TILT_FRAMES], record)})
-    write_atomically(plan.layout.camera, record.model_dump_json(indent=1).encode())
+    write_record(plan.layout.camera, record)
     advance("lens")
     counts = {"corner_px": _corner_shift(record, width, height)}
     if record.residual_px is not None:

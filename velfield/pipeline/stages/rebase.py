@@ -32,7 +32,7 @@ from velfield.pipeline.stages.georeference import (
 )
 from velfield.registration.intersensor.register import register_intersensor
 from velfield.registration.transforms import PolyprojectiveTransform
-from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
+from velfield.run.commits import content_key, digest_path, read_commit, write_record
 from velfield.run.frame_transforms import (
     polyprojective_from_record,
     polyprojective_to_record,
@@ -135,7 +135,7 @@ def rebase_image(plan: Plan, rebase: Rebase) -> StageResult:
     working = read_working(old)
     rescaled = WorkingRecord.model_validate(working.model_dump() | {"scale": working.scale / record.scale})
     for path, model in ((layout.rebased, record), (layout.grid, grid), (layout.working, rescaled)):
-        write_atomically(path, model.model_dump_json(indent=1).encode())
+        write_record(path, model)
         outputs.append(path)
     for name in (old.own_to_base, old.own_base_image, old.own_base_mask, old.map_lens):
         if name.exists():

@@ -18,7 +18,7 @@ from velfield.pipeline.stage import STAGES
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.report.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
-from velfield.run.commits import code_version, record_page, write_atomically
+from velfield.run.commits import code_version, record_page, write_atomically, write_record
 from velfield.run.flight_record import source_name
 from velfield.run.frame_transforms import north_direction_rad, read_grid, read_working
 from velfield.run.layout import RunLayout
@@ -65,7 +65,7 @@ def write_report(plan: Plan, summary: RunSummary, *, preview_of: str | None = No
 
 
 def _write_page(layout: RunLayout, report: Report) -> list[str]:
-    write_atomically(layout.report_record, report.model_dump_json().encode())
+    write_record(layout.report_record, report, indent=None)
     write_view_record(layout)
     figures = report_figures(layout.maps)
     if not page_is_built():
