@@ -136,8 +136,8 @@ def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements]
         yield Diagram(
             "speed-profile",
             f"Speed along lane {lane.number}, the busiest",
-            "Half of the vehicles are slower than the median, 85 % slower than the upper line, 15 % slower than the "
-            "lower one. Grey: 90 % interval of the median.",
+            "Half of the vehicles are slower than the median, and 15 and 85 % slower than the lines so named, which "
+            "are drawn where there are enough vehicles.",
             partial(draw_speed_profile, analysis=analysis, lane=lane.number, unit=unit),
         )
     points = fundamental_points(analysis)
