@@ -173,6 +173,15 @@ def test_a_vehicle_that_stands_for_most_of_a_clip_does_not_outweigh_the_others()
     assert travel.low < 9.6
 
 
+def test_turns_from_a_lane_that_two_vehicles_drove_are_of_its_road() -> None:
+    beside = corner(140.0, 103.3, 220.0)
+    (junction,) = TrafficAnalysis(gather([*crossroads(), drive(beside, 7.0), drive(beside, 47.0)])).movements
+    right = next(m for m in junction.movements if (m.arm_in, m.arm_out) == ("W", "S"))
+    assert right.seen == 14
+    assert right.share is not None
+    assert right.share.value == pytest.approx(14 / 62, abs=1e-6)
+
+
 def test_a_tree_that_cuts_one_movement_leaves_shares_and_counts_as_they_are() -> None:
     cut: list[Track] = []
     for k, (times, xy) in enumerate(crossroads()):

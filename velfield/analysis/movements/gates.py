@@ -12,10 +12,12 @@ from velfield.analysis.lanes.model import Junction, LaneGraph
 
 _ARM_M = 17.0
 """Gates of one arm are nearer to each other: a median may lie between them."""
-_ROAD_M = 20.0
+ROAD_M = 20
 """Arms are told apart so far outside the junction: at a roundabout the entry and the exit of a road diverge."""
 _REACH_M, _ASIDE_M = 6.0, 2.5
 """A vehicle crosses the border at a gate that is no farther from it, and hardly more than half a lane to the side."""
+_BESIDE_M = 4.5
+"""A lane that too few vehicles drove has no gate: of its road is who comes, or goes, no farther beside a gate."""
 _ARM_RAD = np.radians(35)
 """Axes of one arm's gates differ by less."""
 _COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
@@ -132,6 +134,19 @@ class Gates:
 
         The lane beside a gate's may touch the area of the junction, and have no gate: its vehicles are no gate's.
         """
+        return self._best(xy_m, direction_rad, inwards, _ASIDE_M, _REACH_M)
+
+    def of_road(self, xy_m: FloatArray, direction_rad: FloatArray, *, inwards: bool) -> IntArray:
+        """Number of a gate (n,) of the road that vehicles are on `ROAD_M` before a junction, or behind it; -1: none.
+
+        Who turns may cut the corner, or use a lane that too few drove to be found: he crosses the border at no gate.
+        """
+        return self._best(xy_m, direction_rad, inwards, _BESIDE_M, ROAD_M + _ARM_M)
+
+    def _best(
+        self, xy_m: FloatArray, direction_rad: FloatArray, inwards: bool, aside_m: float, reach_m: float
+    ) -> IntArray:
+        """Number of the nearest gate (n,) of like direction that is less than so far away, and to the side."""
         rows = [k for k, gate in enumerate(self.gates) if gate.inwards == inwards]
         if not rows or not len(xy_m):
             return np.full(len(xy_m), -1)
@@ -140,9 +155,9 @@ class Gates:
         dx, dy = (xy_m[:, None] - at[None]).transpose(2, 0, 1)
         distance, aside = np.hypot(dx, dy), np.abs(dy * np.cos(heading) - dx * np.sin(heading))
         turn = np.abs(np.angle(np.exp(1j * (direction_rad[:, None] - heading[None]))))
-        distance = np.where((turn < _ARM_RAD) & (aside < _ASIDE_M), distance, np.inf)
+        distance = np.where((turn < _ARM_RAD) & (aside < aside_m), distance, np.inf)
         best = distance.argmin(axis=1)
-        near = distance[np.arange(len(xy_m)), best] < _REACH_M
+        near = distance[np.arange(len(xy_m)), best] < reach_m
         return np.where(near, np.array(rows)[best], -1)
 
 
@@ -156,7 +171,7 @@ def find_gates(graph: LaneGraph, junction: Junction, names: ArmNames | None = No
             inwards = bool(inside[k + 1])
             found.append((lane.number, inwards, *_middle(lane.xy_m, int(k))))
             outside = np.flatnonzero(~inside[: k + 1] if inwards else ~inside[k + 1 :]) + (0 if inwards else k + 1)
-            way = outside[np.abs(lane.along_m[outside] - lane.along_m[k]) < _ROAD_M]
+            way = outside[np.abs(lane.along_m[outside] - lane.along_m[k]) < ROAD_M]
             far = min(int(way[0] if inwards else way[-1]), len(lane.xy_m) - 2)
             roads.append((lane.number, inwards, *_middle(lane.xy_m, far)))
     arms = group_gates(found, roads)

@@ -18,7 +18,7 @@ from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, 
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import Junction, LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
-from velfield.analysis.movements.gates import Arm, ArmNames, Gates, find_gates
+from velfield.analysis.movements.gates import ROAD_M, Arm, ArmNames, Gates, find_gates
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
@@ -31,6 +31,8 @@ _SLICE_S = 120.0
 """Counts of slices so long show how much the flow varies."""
 MIN_PASSES, _MIN_DELAYED, _MIN_FREE = 3, 10, 3
 """Fewest vehicles of a movement; of which the delay is known; and of these that do not stop."""
+_TURN_RAD = np.radians(40)
+"""Who changes his direction by less goes straight on."""
 _WAITS_S = 1.5
 """A vehicle that needs longer for a metre has stopped."""
 _LEAST_SEEN = 0.5
@@ -191,6 +193,15 @@ def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits_elsewher
     leaves = (last + 1 < len(samples)) & (samples.track[after] == samples.track[last])
     gate_in = np.where(enters, gates.nearest(samples.xy_m[first], samples.direction_rad[first], inwards=True), -1)
     gate_out = np.where(leaves, gates.nearest(samples.xy_m[last], samples.direction_rad[last], inwards=False), -1)
+    before = np.maximum(first - ROAD_M, np.searchsorted(samples.track, samples.track[first]))
+    behind = np.minimum(last + ROAD_M, np.searchsorted(samples.track, samples.track[last], side="right") - 1)
+    turned = np.angle(np.exp(1j * (samples.direction_rad[behind] - samples.direction_rad[before])))
+    # who passes beside all gates, straight on, may be on a lane that is none of the junction's
+    of_junction = (gate_in >= 0) | (gate_out >= 0) | (np.abs(turned) > _TURN_RAD)
+    came = gates.of_road(samples.xy_m[before], samples.direction_rad[before], inwards=True)
+    went = gates.of_road(samples.xy_m[behind], samples.direction_rad[behind], inwards=False)
+    gate_in = np.where(enters & of_junction & (gate_in < 0), came, gate_in)
+    gate_out = np.where(leaves & of_junction & (gate_out < 0), went, gate_out)
     up = np.maximum(first - _UPSTREAM_M, 0)
     reaches = enters & (samples.track[up] == samples.track[first])
     far = np.maximum(up - _FARTHER_M, np.searchsorted(samples.track, samples.track[first]))
@@ -342,6 +353,6 @@ def _turn(arm_in: Arm, arm_out: Arm) -> Turn:
     if arm_in.number == arm_out.number:
         return "u-turn"
     angle = float(np.angle(-np.exp(1j * (arm_out.outward_rad - arm_in.outward_rad))))
-    if abs(angle) < np.radians(40):
+    if abs(angle) < _TURN_RAD:
         return "straight"
     return "right" if angle > 0 else "left"
