@@ -13,7 +13,7 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.tables import all_tables, flow_table, limit_table
 from velfield.report.drawing import new_figure, pages_bytes
 from velfield.report.traffic.approaches import approach_delays, lane_names
-from velfield.report.traffic.diagrams import draw_queues, draw_time_space, red_times, traffic_diagrams
+from velfield.report.traffic.diagrams import draw_delays, draw_queues, draw_time_space, red_times, traffic_diagrams
 from velfield.report.traffic.first_page import FirstPage, first_page
 from velfield.report.traffic.report import report_html
 
@@ -119,7 +119,11 @@ def test_delay_of_an_approach_is_the_mean_over_its_vehicles(
     assert delays["W"].delay_s.value == pytest.approx(total / sum(m.seen + m.inferred for m in mine))
     assert set(delays["W"].level.split(" to ")) <= {"A", "B"}
     monkeypatch.setitem(analysis.signals, number, replace(analysis.signals[number], signalised=None))
-    assert {d.level for d in approach_delays(analysis, found)} == {""}
+    without_level = approach_delays(analysis, found)
+    assert {d.level for d in without_level} == {""}
+    axes = new_figure(7, 3).add_subplot()
+    draw_delays(axes, delays=without_level[:1])
+    assert axes.get_xlim()[1] > without_level[0].delay_s.high
     assert sorted(name.split(",")[0] for name in lane_names(found).values()) == ["from N", "from W"]
 
 

@@ -162,7 +162,7 @@ def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements]
 def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
     """Delay by approach with levels of service."""
     limits = delays[0].limits_s
-    top = max(max(d.delay_s.high for d in delays) * 1.8, *limits[1:2])
+    top = max(*(d.delay_s.high * 1.8 for d in delays), *limits[1:2], 1.0)
     for limit in limits:
         if limit < top:
             axes.axvline(limit, color="#8a929b", linestyle="--", linewidth=0.8, zorder=0)
