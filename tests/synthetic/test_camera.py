@@ -25,7 +25,7 @@ from velfield.synthetic.cases import (
     two_term_lens,
     vibration_and_drift,
 )
-from velfield.synthetic.flight import simulate
+from velfield.synthetic.flight import Flight
 
 EMPTY = TrafficSimulation(flow_veh_per_h=0, warm_up_s=0)
 SAME_SENSOR = OtherSensorSimulation(same_sensor=True, noise_grey=0)
@@ -38,7 +38,7 @@ def raw_points(config: SimulationConfig, n: int = 400, seed: int = 0) -> FloatAr
 
 @pytest.mark.parametrize("case", [homography_only, lens_only, lens_and_wobble, vibration_and_drift, two_term_lens])
 def test_to_raw_inverts_to_base(case) -> None:
-    flight = simulate(case(width=640, height=480, frames=4))
+    flight = Flight(case(width=640, height=480, frames=4))
     xy = raw_points(flight.config)
     for frame in range(4):
         base = flight.camera.to_base(frame, xy)
@@ -56,7 +56,7 @@ def test_to_raw_inverts_to_base_for_any_camera(seed: int, a: float, wobble: floa
 
 
 def test_without_lens_shutter_and_relief_the_map_is_a_homography() -> None:
-    flight = simulate(homography_only(width=640, height=480, frames=3))
+    flight = Flight(homography_only(width=640, height=480, frames=3))
     xy = raw_points(flight.config)
     base = flight.camera.to_base(2, xy)
     matrix, _ = cv2.findHomography(xy, base, 0)
@@ -131,4 +131,4 @@ def test_rendered_features_are_where_the_truth_has_them(camera: CameraSimulation
 def test_a_lens_that_folds_within_the_frame_is_refused() -> None:
     config = small_flight().config.model_copy(update={"camera": CameraSimulation(lens_terms=(-0.5,))})
     with pytest.raises(InputError, match="found a lens that folds"):
-        simulate(config)
+        Flight(config)

@@ -61,7 +61,7 @@ def city(width: int, height: int) -> NDArray[np.uint8]:
 
 def cnn_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
     """The CNN, beside convolutions of YOLOv8n's sizes on such a frame."""
-    fast = _fastest(lambda: detect_frame(image, None, detector), 2)
+    fast = fastest_s(lambda: detect_frame(image, None, detector), 2)
     peer = 0.0
     for step, taps, into, out in YOLOV8N:
         peer += _convolution_seconds((image.shape[0] // step, image.shape[1] // step), taps, into, out)
@@ -96,7 +96,7 @@ def matmul_gflops() -> float:
     """
     size, side = 1024, 64
     a = np.ones((size, size), np.float32)
-    by_numpy = 2.0 * size**3 / _fastest(lambda: a @ a, 7)
+    by_numpy = 2.0 * size**3 / fastest_s(lambda: a @ a, 7)
     channels = size // 2
     by_engine = 2.0 * (channels * side) ** 2 / _convolution_seconds((side, side), 1, channels, channels, repeats=7)
     return max(by_numpy, by_engine) / 1e9
@@ -114,10 +114,10 @@ def _convolution_seconds(size: tuple[int, int], taps: int, into: int, out: int, 
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = ort.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     image = np.ones((1, into, *size), np.float32)
-    return _fastest(partial(session.run, None, {"x": image}), repeats)
+    return fastest_s(partial(session.run, None, {"x": image}), repeats)
 
 
-def _fastest(work: Callable[[], object], repeats: int) -> float:
+def fastest_s(work: Callable[[], object], repeats: int) -> float:
     """The fastest of some runs, s of processor time; one before them compiles."""
     work()
     times = []

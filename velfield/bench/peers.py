@@ -13,6 +13,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.simulation import SimulationConfig
 from schemas.tables import DETECTION_COLUMNS
+from velfield.bench.detection import fastest_s
 from velfield.bench.registration import register_by_stabilo
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
@@ -93,13 +94,13 @@ def time_accumulation(plan: Plan) -> list[str]:
     for row, column in busiest:
         mine, origin = segments[by_tile[row, column]], (column * side, row * side)
         accumulate = partial(accumulate_tile, mine, origin_xy=origin, shape=(side, side), bins=bins, radius_px=radius)
-        ours += _processor_s(accumulate)
+        ours += fastest_s(accumulate, 1)
         work.append(_samples(mine, origin, side, bins, radius or 0.75))
     axes = [np.arange(n + 1, dtype=np.float64) - 0.5 for n in (side, side, bins.n, bins.n)]
     lines = []
     for name, count in (("boost-histogram", _boost_histogram), ("xhistogram", _xhistogram)):
         fill = count(axes)
-        theirs = sum(_processor_s(partial(fill, samples)) for samples in work)
+        theirs = sum(fastest_s(partial(fill, samples), 1) for samples in work)
         lines.append(_compare(f"accumulation, {len(busiest)} tiles", ours, f"{name}, counts alone", theirs))
     return lines
 
@@ -142,16 +143,6 @@ def _xhistogram(axes: Sequence[FloatArray]) -> Callable[[Samples], object]:
     except ImportError:
         raise InputError("found no xhistogram, a peer of accumulation; pip install xhistogram") from None
     return lambda samples: histogram(*samples, bins=list(axes))
-
-
-def _processor_s(work: Callable[[], object]) -> float:
-    """Processor time of the faster of two calls."""
-    seconds = []
-    for _ in range(2):
-        start = time.process_time()
-        work()
-        seconds.append(time.process_time() - start)
-    return min(seconds)
 
 
 def _compare(what: str, seconds: float, peer: str, peer_seconds: float) -> str:

@@ -8,7 +8,7 @@ from schemas.simulation import (
     SimulationConfig,
 )
 from velfield.synthetic.camera import fold_radius
-from velfield.synthetic.flight import Flight, simulate
+from velfield.synthetic.flight import Flight
 
 FLAT = SceneSimulation(relief_m=0.0, building_height_m=0.0, tree_height_m=0.0)
 """A plane without relief, buildings and trees; vehicles still have a height."""
@@ -65,4 +65,4 @@ def vibration_and_drift(*, width: int = 1280, height: int = 960, frames: int = 6
 def small_flight(*, frames: int = 12, width: int = 640, height: int = 480, seed: int = 0, **sections: object) -> Flight:
     """A small flight in memory for tests; ``sections`` (camera=..., scene=...) replace those of the configuration."""
     values: dict[str, object] = {"seed": seed, "frames": frames, "width": width, "height": height, **sections}
-    return simulate(SimulationConfig.model_validate(values))
+    return Flight(SimulationConfig.model_validate(values))

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
 from schemas.simulation import SimulationConfig
+from velfield.sources.telemetry.attitude import DIAGONAL_35MM
 from velfield.synthetic.camera import Camera
 from velfield.synthetic.random_streams import RandomStream, random_generator
 
 CLIP_NAME, SUBTITLE_NAME = "DJI_0001.MP4", "DJI_0001.SRT"
 _TIME_BASE = Fraction(1, 90_000)
 _START = datetime(2026, 5, 4, 8, 30, tzinfo=UTC)
-_DIAGONAL_35MM = 43.267
 _ASS_HEADER = b"""[Script Info]
 ScriptType: v4.00+
 
@@ -52,7 +52,7 @@ def simulate_telemetry(config: SimulationConfig, camera: Camera, base_shape: tup
     longitude, latitude = _positions(config, poses[:, 9:11], base_shape, offset[:2])
     yaw, pitch, roll = _attitude(poses[:, :9].reshape(-1, 3, 3), t.north_deg, float(offset[3]), rng)
     whole = np.hypot(config.width, config.height) / camera.focal_px
-    focal = round(_DIAGONAL_35MM / float(whole))
+    focal = round(DIAGONAL_35MM / float(whole))
     return [
         _subtitle(k, camera.times_s, focal, (longitude[k], latitude[k]), height_m[k], (yaw[k], pitch[k], roll[k]))
         for k in range(config.frames)

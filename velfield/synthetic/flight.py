@@ -32,7 +32,7 @@ def frame_times(times: TimesSimulation, frames: int, rng: np.random.Generator) -
 
 
 class Flight:
-    """A simulated flight.
+    """A simulated flight; its parts are computed at the first access.
 
     Attributes
     ----------
@@ -229,11 +229,6 @@ class Flight:
         low = np.clip(np.floor(raw.min(axis=0)) - 2, 0, limit)
         high = np.clip(np.ceil(raw.max(axis=0)) + 2, -1, limit)
         return np.column_stack([low, high]).astype(np.int64)
-
-
-def simulate(config: SimulationConfig) -> Flight:
-    """The flight of a configuration; its parts are computed at the first access."""
-    return Flight(config)
 
 
 def _largest_slope(config: SimulationConfig, half: float) -> float:

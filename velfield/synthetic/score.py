@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
+from velfield.detection.orientation import axial_difference
 from velfield.synthetic.truth import Truth
 
 ToBase = Callable[[int, FloatArray], FloatArray]
@@ -198,10 +199,10 @@ def score_detections(
         here = cars.iloc[pairs[:, 1]]
         rotation = 0.0 if to_truth is None else float(np.arctan2(to_truth[1, 0], to_truth[0, 0]))
         orientation = found["orientation_rad"].to_numpy(dtype=np.float64)[pairs[:, 0]]
-        axis = orientation + rotation - here["orientation_rad"].to_numpy()
+        axis = axial_difference(orientation + rotation, here["orientation_rad"].to_numpy())
         position = xy[pairs[:, 0]] - here[["x_base_px", "y_base_px"]].to_numpy()
         matches.append(
-            pd.DataFrame({"moving": here["moving"].to_numpy(), "axis": _axial(axis), "position": np.hypot(*position.T)})
+            pd.DataFrame({"moving": here["moving"].to_numpy(), "axis": axis, "position": np.hypot(*position.T)})
         )
     table = (
         pd.concat(matches, ignore_index=True) if matches else pd.DataFrame({"moving": [], "axis": [], "position": []})
@@ -391,8 +392,3 @@ def _true_triples(truth: Truth, windows: list[tuple[int, int, int]]) -> set[tupl
         both = evaluated[window[0]] & evaluated[window[2]] & moving[window[1]]
         out |= {(window[1], vehicle) for vehicle in both}
     return out
-
-
-def _axial(angle: FloatArray) -> FloatArray:
-    """Absolute difference of two axes, [0, pi/2]."""
-    return np.asarray(np.abs(np.mod(angle + np.pi / 2, np.pi) - np.pi / 2))

@@ -13,7 +13,7 @@ from schemas.simulation import SimulationConfig
 from velfield.errors import InputError
 from velfield.parallel import map_ahead
 from velfield.synthetic.clip import open_clip, simulate_telemetry
-from velfield.synthetic.flight import Flight, simulate
+from velfield.synthetic.flight import Flight
 from velfield.synthetic.truth import make_truth, save_truth
 
 _RENDERED_AHEAD = 4
@@ -36,7 +36,7 @@ def write_flight(out: Path, config: SimulationConfig, progress: Callable[[int, i
         ``out`` holds a flight of another configuration, or other files.
     """
     _claim(out, config)
-    flight = simulate(config)
+    flight = Flight(config)
     flight.prepare()
     _write_image(out / "base.png", flight.base_image, [])
     names = [frame_name(k, config) for k in range(config.frames)]

@@ -1,8 +1,11 @@
-"""Attitudes as rotations: angles of Euler are ambiguous where a camera looks straight down."""
+"""Attitudes as rotations (angles of Euler are ambiguous where a camera looks straight down), and the film format."""
 
 import numpy as np
 
 from schemas.arrays import FloatArray
+
+DIAGONAL_35MM = 43.267
+"""Diagonal of 36 mm x 24 mm film, mm: equivalent focal lengths compare diagonal angles of view."""
 
 
 def rotation_to_ned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:

@@ -10,11 +10,11 @@ import numpy as np
 from PIL import ExifTags
 
 from velfield.sources.images import image_size, read_image_tags
-from velfield.sources.telemetry.attitude import camera_angles, rotation_to_ned
+from velfield.sources.telemetry.attitude import DIAGONAL_35MM, camera_angles, rotation_to_ned
 
 _FOCAL_35MM, _FOCAL, _ZOOM, _TAKEN, _FRACTION, _WIDTH, _HEIGHT = 0xA405, 0x920A, 0xA404, 0x9003, 0x9291, 0xA002, 0xA003
 _CENTRE = (("CalibratedOpticalCenterX", "x"), ("CalibratedOpticalCenterY", "y"))
-_SAME_ASPECT, _MAX_CENTRE, _MAX_LOG_FOCAL, _DIAGONAL_35MM = 0.01, 0.15, 0.3, 43.267
+_SAME_ASPECT, _MAX_CENTRE, _MAX_LOG_FOCAL = 0.01, 0.15, 0.3
 _CROPS = 0.9, 15.0
 """Equivalent over own focal length: 1 of 36 mm x 24 mm, up to 15 of a telephone's sensors."""
 _XMP_NUMBER = r"""\s*(?:=\s*["']|>)\s*([-+]?\d+(?:\.\d+)?)(?:/(\d+))?"""
@@ -84,7 +84,7 @@ def _of_this_size(
         left = {name: value for name, value in found.items() if name not in across}
         return left, [f"{note}: a part of the picture, so that their focal length is not used"] if left != found else []
     factor = width / written[0]
-    equivalent_px = found.get("focal_35mm", 0.0) / _DIAGONAL_35MM * float(np.hypot(*written))
+    equivalent_px = found.get("focal_35mm", 0.0) / DIAGONAL_35MM * float(np.hypot(*written))
     # The optical centre lies near the middle of the picture that was calibrated.
     off = abs(np.log(2 * centre["x"] * factor / width)) if centre.get("x", 0) > 0 else 0.0
     if "focal_px" in found:

@@ -16,10 +16,9 @@ from schemas.arrays import FloatArray, Points
 from schemas.scale import ScaleEstimate
 from velfield.errors import Failure
 from velfield.sources.geo import utm_crs
+from velfield.sources.telemetry.attitude import DIAGONAL_35MM
 from velfield.sources.telemetry.telemetry import Telemetry
 
-_DIAGONAL_35MM = 43.267
-"""Diagonal of 36 mm x 24 mm film, mm: equivalent focal lengths compare diagonal angles of view."""
 _PHOTO_ASPECT = 1.55
 """Up to this ratio of width to height a frame shows the whole sensor (4:3, 3:2); a wider one is cropped in height."""
 _CROPPED_DIAGONAL = 1.25
@@ -82,7 +81,7 @@ class FramePoses:
         """Focal length, px of the raw frame, (n,); the maker's calibration before angles of view and the equivalent."""
         whole = self.width <= _PHOTO_ASPECT * self.height
         diagonal = np.hypot(self.width, self.height) if whole else _CROPPED_DIAGONAL * self.width
-        equivalent = self.telemetry.focal_35mm / _DIAGONAL_35MM * diagonal
+        equivalent = self.telemetry.focal_35mm / DIAGONAL_35MM * diagonal
         focal = np.where(np.isfinite(self.telemetry.focal_px), self.telemetry.focal_px, equivalent)
         zoomed = focal * np.where(np.isfinite(self.telemetry.zoom), np.maximum(self.telemetry.zoom, 1.0), 1.0)
         by_width = self.width / 2 / np.tan(np.radians(self.telemetry.hfov_deg / 2))
