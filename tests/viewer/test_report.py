@@ -15,10 +15,9 @@ from schemas.report import Report, ReportFigure, ReportStage, ResidualSeries
 from velfield.errors import InputError
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.report.figures import MapScale, direction_figure, jpeg_bytes, png_bytes, speed_figure
-from velfield.report.gates import rejection_table, totals_table
 from velfield.report.panel import bar_ticks
 from velfield.report.plots import highest_of_runs, precision_recall_plot
-from velfield.report.report import render_report
+from velfield.report.report import rejection_table, render_report, totals_table
 from velfield.tracking.gates import GateLog
 
 GREY = np.full((480, 640), 100, np.uint8)

@@ -11,8 +11,7 @@ from velfield.analysis.intervals import Estimate
 from velfield.exports.gis.cog import write_cog
 from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
 from velfield.field.segments import stationary_speed_px_per_s
-from velfield.report.change import change_figure
-from velfield.report.figures import MapScale, png_bytes
+from velfield.report.figures import MapScale, change_figure, png_bytes
 from velfield.report.traffic.before_after import before_after_html
 from velfield.run.commits import write_atomically
 from velfield.run.field_algebra import check_same_grid

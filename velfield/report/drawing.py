@@ -49,7 +49,14 @@ def figure_pixels(figure: "Figure") -> RGBImage:
 
 def figure_bytes(figure: "Figure", kind: Literal["pdf", "svg", "png"]) -> bytes:
     """The figure as a file, without a date in it."""
-    return pages_bytes([figure]) if kind == "pdf" else _saved(figure, kind)
+    if kind == "pdf":
+        return pages_bytes([figure])
+    import matplotlib
+
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(buffer, format=kind, metadata=_METADATA[kind])
+    return buffer.getvalue()
 
 
 def pages_bytes(figures: Sequence["Figure"]) -> bytes:
@@ -61,13 +68,4 @@ def pages_bytes(figures: Sequence["Figure"]) -> bytes:
     with matplotlib.rc_context(_STYLE), PdfPages(buffer, metadata=_METADATA["pdf"]) as pages:
         for figure in figures:
             pages.savefig(figure)
-    return buffer.getvalue()
-
-
-def _saved(figure: "Figure", kind: str) -> bytes:
-    import matplotlib
-
-    buffer = io.BytesIO()
-    with matplotlib.rc_context(_STYLE):
-        figure.savefig(buffer, format=kind, metadata=_METADATA[kind])
     return buffer.getvalue()

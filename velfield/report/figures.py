@@ -1,4 +1,4 @@
-"""The field's two figures over the dimmed base image (paper: velocity field): direction as hue, speed as colour."""
+"""Figures over the dimmed base image (paper: velocity field): direction as hue; speed and changes as colour."""
 
 import io
 from dataclasses import dataclass, replace
@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from schemas.arrays import FloatArray, GreyImage, Mask, RGBImage
+from schemas.arrays import FloatArray, GreyImage, RGBImage
 from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.errors import InputError
-from velfield.report.colours import direction_colours, ramp_colours
+from velfield.report.colours import change_colours, direction_colours, ramp_colours
 from velfield.report.panel import Legend, legend_panel
 
 _DIMMED = 0.5
@@ -112,6 +112,21 @@ def speed_figure(
     return beside(image, legend if bar_gsd_m is None else replace(legend, gsd_m=bar_gsd_m))
 
 
+def change_figure(grey: GreyImage, change: NDArray[np.floating], scale: MapScale, *, title: str) -> RGBImage:
+    """The change of one quantity between two fields: blue for less, orange for more; else as `direction_figure`.
+
+    Parameters
+    ----------
+    change
+        (h, w) change, in the unit in the title. NaN is not drawn.
+    """
+    known = np.isfinite(change)
+    top = round_up(float(np.percentile(np.abs(change[known]), 99))) if known.any() else 10.0
+    image = blend_over_image(grey, change, change_colours(change / top))
+    note = "After minus before, where significant. Bare grey: no significant change."
+    return beside(image, Legend(title, note, "change", top, scale.gsd_m, scale.north_rad))
+
+
 def beside(image: RGBImage, legend: Legend) -> RGBImage:
     """A map with its legend to the right of it."""
     return np.hstack([image, legend_panel(image.shape, legend)])
@@ -167,19 +182,12 @@ def blend_over_image(grey: GreyImage, values: NDArray[np.floating], colours: RGB
     InputError
         Where the shapes differ.
     """
-    _same_shape(grey, values)
-    return _blend(grey, colours, np.isfinite(values))
-
-
-def _blend(grey: GreyImage, colours: RGBImage, known: Mask) -> RGBImage:
-    """Blend colours over the dimmed image where known, modulated by it so that kerbs and lanes stay visible."""
-    image = np.repeat((grey.astype(np.float32) * _DIMMED).astype(np.uint8)[..., None], 3, axis=2)
-    image[known] = colours[known] * (_COVER + (1 - _COVER) * grey[known][:, None].astype(np.float32) / 255)
-    return image
-
-
-def _same_shape(grey: GreyImage, values: NDArray[np.floating]) -> None:
     if grey.shape != values.shape:
         raise InputError(
             f"the base image is {grey.shape} and the field {values.shape} (height, width): they must agree"
         )
+    known = np.isfinite(values)
+    image = np.repeat((grey.astype(np.float32) * _DIMMED).astype(np.uint8)[..., None], 3, axis=2)
+    # Modulated by the image, so that kerbs and lanes stay visible.
+    image[known] = colours[known] * (_COVER + (1 - _COVER) * grey[known][:, None].astype(np.float32) / 255)
+    return image

@@ -5,7 +5,7 @@ its hash, and all external text (names, messages) is escaped.
 """
 
 from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from hashlib import sha256
 from html import escape
 from importlib.resources import files
@@ -13,8 +13,29 @@ from urllib.parse import quote
 
 from schemas.report import Report, ReportFigure, ReportStage
 from velfield.errors import count_text
-from velfield.report.gates import rejection_table, totals_table
 from velfield.report.plots import precision_recall_plot, residual_plot
+
+_TOTALS = {
+    "windows": "Windows of three frames",
+    "links_tried": "Links tried, from a car to one in the next frame",
+    "pairs_tried": "Pairs of links tried, over three frames",
+    "tracklets": "Pairs accepted: tracklets",
+    "moving_candidates": "Tracklets of candidates that the detector was not sure of, by their motion",
+    "links_refined": "Links of tracklets refined in the images",
+    "links_not_refined": "Links of tracklets not refined",
+}
+_REJECTIONS = {
+    "frames_not_registered": ("frames", "not registered to the map", None),
+    "gaps_too_long": ("frames", "the next one comes too late", None),
+    "speed": ("links", "faster than a vehicle", "links_tried"),
+    "axis": ("links", "not along the car's axis", "links_tried"),
+    "appearance": ("links", "another car has the more similar appearance", "links_tried"),
+    "turn": ("pairs", "change direction too fast", "pairs_tried"),
+    "acceleration": ("pairs", "change speed too fast", "pairs_tried"),
+    "not_best": ("pairs", "another pair with the same car is more likely", "pairs_tried"),
+    "confidence": ("pairs", "most likely, but ambiguous", "pairs_tried"),
+}
+"""Gate -> what it rejects, why, and the total it is a fraction of."""
 
 
 def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
@@ -171,6 +192,26 @@ def _gates(gates: dict[str, int]) -> str:
     kept = _table(["Candidates", "Number"], totals_table(gates), numbers=1)
     lost = _table(["Rejected", "Reason", "Number", "Fraction"], rejection_table(gates), numbers=2)
     return _section("Tracking", _scrolled("Candidates", kept) + _scrolled("Rejected", lost))
+
+
+def totals_table(gates: Mapping[str, int]) -> list[tuple[str, ...]]:
+    """Candidates and accepted ones: description and count. A count without a description has its own name."""
+    known = [(words, f"{gates[name]:,}") for name, words in _TOTALS.items() if name in gates]
+    others = [name for name in gates if name not in _TOTALS and name not in _REJECTIONS]
+    return [*known, *((name.replace("_", " "), f"{gates[name]:,}") for name in others)]
+
+
+def rejection_table(gates: Mapping[str, int]) -> list[tuple[str, ...]]:
+    """Rejected candidates by gate: kind, reason, count, and fraction of those tried."""
+    return [
+        (kind, why, f"{gates[name]:,}", _fraction(gates[name], gates.get(total or "", 0)))
+        for name, (kind, why, total) in _REJECTIONS.items()
+        if name in gates
+    ]
+
+
+def _fraction(count: int, tried: int) -> str:
+    return f"{100 * count / tried:.0f} %" if tried else ""
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: int) -> str:

@@ -84,13 +84,17 @@ def finite_cell(path: Path, line: int, row: dict[str, str], name: str) -> float:
     text = row.get(name, "")
     if text == "":
         return math.nan
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+    if not is_number(text):
         raise InputError(f"{path.name}: line {line}: found {name} {text!r}, expected a finite number; fix line {line}")
-    return value
+    return float(text)
+
+
+def is_number(text: str) -> bool:
+    """Whether a cell is a finite number."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def number_cell(path: Path, line: int, row: dict[str, str], name: str) -> float:

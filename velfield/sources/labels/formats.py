@@ -16,10 +16,9 @@ from xml.etree import ElementTree
 from velfield.errors import InputError, parse_json
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.annotation import Parsed, box_points, point_pairs
-from velfield.sources.labels.text import read_text_labels, text_kind
+from velfield.sources.labels.text import read_head, read_text_labels, text_kind
 from velfield.sources.table import read_text
 
-_HEAD = 4000
 SUFFIXES = (".txt", ".json", ".geojson", ".xml", ".csv")
 _ANGLE_KEYS = ("angle", "theta", "rotation", "orientation", "rotation_deg", "rbox", "rbbox", "rotated_box", "direction")
 
@@ -328,9 +327,7 @@ _CSV = (
 
 
 def _csv_reader(path: Path) -> Reader | None:
-    with path.open("rb") as file:
-        line = file.read(_HEAD).decode("utf-8-sig", "replace").split("\n", 1)[0]
-    header = {name.strip().strip('"') for name in line.strip().split(",")}
+    header = {name.strip().strip('"') for name in next(iter(read_head(path)), "").split(",")}
     return next((reader for reader in _CSV if reader.recognises(header)), None)
 
 

@@ -7,25 +7,30 @@ from pathlib import Path
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.annotation import Annotation, Parsed, box_points, point_pairs
-from velfield.sources.table import read_text
+from velfield.sources.table import is_number, read_text
 
-_HEAD = 4000
+_HEAD_BYTES = 4000
+
+
+def read_head(path: Path) -> list[str]:
+    """The first lines of a file, the last of them perhaps cut."""
+    with path.open("rb") as file:
+        return file.read(_HEAD_BYTES).decode("utf-8-sig", "replace").splitlines()
 
 
 def text_kind(path: Path) -> str | None:
     """Dialect of a .txt file, by its first line of labels; empty if it has none."""
-    with path.open("rb") as file:
-        lines = [line.strip() for line in file.read(_HEAD).decode("utf-8-sig", "replace").splitlines()]
+    lines = (line.strip() for line in read_head(path))
     line = next((one for one in lines if one and not re.match(r"(imagesource|gsd)\s*:", one)), "")
     words = line.split()
     if not line:
         return ""
-    if len(words) in (9, 10) and all(map(_is_number, words[:8])) and not _is_number(words[8]):
+    if len(words) in (9, 10) and all(map(is_number, words[:8])) and not is_number(words[8]):
         return "DOTA"
-    if len(words) >= 5 and all(map(_is_number, words)):
+    if len(words) >= 5 and all(map(is_number, words)):
         return "YOLO"
     cells = [cell for cell in line.split(",") if cell]
-    return "VisDrone" if len(cells) == 8 and all(map(_is_number, cells)) else None
+    return "VisDrone" if len(cells) == 8 and all(map(is_number, cells)) else None
 
 
 _VISDRONE = (
@@ -41,14 +46,14 @@ def read_text_labels(path: Path, info: SourceInfo, found: Parsed, image: str) ->
         words = line.split()
         if not words or (kind == "DOTA" and re.match(r"(imagesource|gsd)\s*:", line)):
             continue
-        if kind == "DOTA" and len(words) in (9, 10) and all(map(_is_number, words[:8])):
+        if kind == "DOTA" and len(words) in (9, 10) and all(map(is_number, words[:8])):
             found.draw(image, words[8], point_pairs(words[:8]))
             continue
         cells = [cell.strip() for cell in line.split(",") if cell.strip()]
-        if kind == "VisDrone" and len(cells) == 8 and all(map(_is_number, cells)) and 0 <= int(cells[5]) <= 11:
+        if kind == "VisDrone" and len(cells) == 8 and all(map(is_number, cells)) and 0 <= int(cells[5]) <= 11:
             found.draw(image, _VISDRONE[int(cells[5])], box_points(*cells[:4]))
             continue
-        if kind in ("DOTA", "VisDrone") or not all(map(_is_number, words)) or len(words) not in (5, 6, *range(8, 4000)):
+        if kind in ("DOTA", "VisDrone") or not all(map(is_number, words)) or len(words) not in (5, 6, *range(8, 4000)):
             expected = {"DOTA": "DOTA `x1 y1 ... x4 y4 class difficulty`", "VisDrone": "VisDrone's eight numbers"}.get(
                 kind or "",
                 "YOLO `class x y width height` or `class x1 y1 x2 y2 x3 y3 x4 y4`, normalised to the image",
@@ -80,10 +85,3 @@ def _yolo(path: Path, line: int, image: str, values: list[float], info: SourceIn
         (x, y), (w, h) = points
         points = box_points(x - w / 2, y - h / 2, w, h)
     return Annotation(image, int(values[0]), points, score=score)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False

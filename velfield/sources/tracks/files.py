@@ -13,6 +13,7 @@ import pandas as pd
 
 from schemas.arrays import FloatArray
 from velfield.errors import InputError, one_line
+from velfield.sources.table import is_number
 from velfield.sources.tracks.formats import MOT_COLUMNS, normal_name
 
 _SEPARATORS = (";", "\t", "|", ",")
@@ -143,7 +144,7 @@ def _read_csv(path: Path, text: str) -> pd.DataFrame:
     if wide is not None:
         return _unroll(path, text, separator, *wide)
     names: list[str] | None = None
-    if all(_is_number(cell) for cell in header if cell):
+    if all(is_number(cell) or cell.lower() == "nan" for cell in header if cell):
         if len(header) not in (9, 10) or separator != ",":
             raise InputError(f"{path}: found numbers in line 1, expected a header; name the columns there")
         names = [*MOT_COLUMNS[: len(header)]]
@@ -203,14 +204,6 @@ def _without_comments(text: str, separator: str) -> str:
             return text[1:].lstrip(" ")
         text = rest
     return text
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _wide_columns(header: list[str]) -> tuple[list[str], list[str], str] | None:
