@@ -11,37 +11,36 @@ from velfield.tracking.association import (
     APPEARANCE_EXPONENT,
     FALSE_ALARM_COST,
     MIN_TYPICAL_DIFFERENCE,
-    Triples,
     appearance_cost,
     best_triples,
     mutual_best_links,
     typical_difference,
 )
-from velfield.tracking.gates import DEFAULT_AXIS_SD_RAD, DetectionStates, GateLog, Limits, gate_link_pairs, gate_links
+from velfield.tracking.gates import DEFAULT_AXIS_SD_RAD, DetectionStates, Limits, gate_link_pairs, gate_links
 from velfield.tracking.tracklets import link_windows
 
 LIMITS = Limits.from_config(TrackingConfig(), None)
 
 
-def triples(*rows: tuple[int, int, int, float]) -> Triples:
+def triples(*rows: tuple[int, int, int, float]) -> tuple[np.ndarray, np.ndarray]:
     table = np.array(rows, np.float64)
-    return Triples(table[:, :3].astype(np.int64), table[:, 3].copy())
+    return table[:, :3].astype(np.int64), table[:, 3].copy()
 
 
 def test_a_single_triple_is_the_best_and_as_confident_as_against_a_false_alarm() -> None:
-    best, confidence = best_triples(triples((0, 0, 0, 5.0)), (1, 1, 1))
+    best, confidence = best_triples(*triples((0, 0, 0, 5.0)), (1, 1, 1))
     assert best.tolist() == [True]
     assert confidence[0] == pytest.approx(1 / (1 + np.exp(5.0 - FALSE_ALARM_COST)))
-    _, even = best_triples(triples((0, 0, 0, FALSE_ALARM_COST)), (1, 1, 1))
+    _, even = best_triples(*triples((0, 0, 0, FALSE_ALARM_COST)), (1, 1, 1))
     assert even[0] == pytest.approx(0.5)
 
 
 def test_a_competitor_through_one_detection_halves_the_confidence_and_a_tie_leaves_none() -> None:
     rivals = triples((0, 0, 0, 4.0), (1, 0, 1, 4.0 + np.log(3)), (2, 2, 2, 4.0))
-    best, confidence = best_triples(rivals, (3, 3, 3))
+    best, confidence = best_triples(*rivals, (3, 3, 3))
     assert best.tolist() == [True, False, True]
     assert confidence == pytest.approx([3 / 4, 1 / 4, 1.0], abs=1e-5)
-    tied, _ = best_triples(triples((0, 0, 0, 4.0), (1, 0, 1, 4.0)), (2, 1, 2))
+    tied, _ = best_triples(*triples((0, 0, 0, 4.0), (1, 0, 1, 4.0)), (2, 1, 2))
     assert not tied.any()
 
 
@@ -50,7 +49,7 @@ def test_a_competitor_through_one_detection_halves_the_confidence_and_a_tie_leav
 def test_the_best_triples_and_confidences_are_those_of_their_definition(seed: int, m: int) -> None:
     rng = np.random.default_rng(seed)
     detections, cost = rng.integers(0, 4, (m, 3)), rng.uniform(0, 20, m).round(1)
-    best, confidence = best_triples(Triples(detections, cost), (4, 4, 4))
+    best, confidence = best_triples(detections, cost, (4, 4, 4))
     likelihood = np.exp(-cost)
     for t in range(m):
         through = [np.flatnonzero(detections[:, k] == detections[t, k]) for k in range(3)]
@@ -124,16 +123,6 @@ def test_limits_in_pixels_are_metres_over_the_ground_sample_distance(gsd_m: floa
     assert limits.max_acceleration_px_per_s2 == pytest.approx(20.0 / gsd_m)
     assert limits.position_sd_px(0.4) == pytest.approx(np.hypot(config.jitter_px, 0.4))
     assert Limits.from_config(config, None) == Limits.from_config(config, PAPER_GSD_M)
-
-
-def test_a_gate_log_counts_from_zero_and_lists_its_gates() -> None:
-    log = GateLog()
-    assert (log["speed"], len(log), list(log)) == (0, 0, [])
-    log.add("speed", 3)
-    log.add("speed", 2)
-    log.add("axis", 1)
-    assert dict(log) == {"speed": 5, "axis": 1}
-    assert dict(log + log) == {"speed": 10, "axis": 2}
 
 
 def test_unaligned_crops_keep_the_displacement_and_deviation_of_the_detections() -> None:

@@ -46,29 +46,29 @@ def test_an_end_is_extended_by_what_moves_as_predicted_and_by_nothing_else(forwa
     aside, standing = way + np.array([0.0, 3.0]), np.repeat([[sign * 3.0, 0.1]], 7, axis=0)
     seen = candidates(np.tile(frames, 3), np.concatenate([way, aside, standing]))
     free = np.ones(len(seen), bool)
-    found = extend_tracks(end(10, 0.0, 10.0), np.array([0]), seen, free, forward=forward)
-    assert sorted(seen.frame[found.candidate]) == sorted(frames)
-    assert np.abs(seen.position_m[found.candidate, 1]).max() < 1
-    assert found.ends.frame.tolist() == [10 + 7 * sign]
-    assert found.ends.velocity_m_per_s[0, 0] == pytest.approx(10, abs=0.8)
+    _, found, ends = extend_tracks(end(10, 0.0, 10.0), np.array([0]), seen, free, forward=forward)
+    assert sorted(seen.frame[found]) == sorted(frames)
+    assert np.abs(seen.position_m[found, 1]).max() < 1
+    assert ends.frame.tolist() == [10 + 7 * sign]
+    assert ends.velocity_m_per_s[0, 0] == pytest.approx(10, abs=0.8)
     assert free.sum() == 14
-    across = extend_tracks(
+    across, _, _ = extend_tracks(
         end(10, 0.0, 10.0), np.array([0]), replace(seen, axis_rad=np.full(21, 1.2)), free | True, forward=forward
     )
-    assert not len(across.track)  # a car that lies across the way
+    assert not len(across)  # a car that lies across the way
 
 
 def test_an_end_is_not_extended_over_a_long_silence() -> None:
     seen = candidates(np.array([16]), np.array([[12.0, 0.0]]))
-    found = extend_tracks(end(10, 0.0, 10.0), np.array([0]), seen, np.ones(1, bool), forward=True)
-    assert not len(found.candidate)
+    _, found, _ = extend_tracks(end(10, 0.0, 10.0), np.array([0]), seen, np.ones(1, bool), forward=True)
+    assert not len(found)
 
 
 def test_one_candidate_is_of_one_track() -> None:
     seen = candidates(np.array([11]), np.array([[2.0, 0.4]]))
     both = together(end(10, 0.0, 10.0), end(10, 0.0, 10.0, y=1.0))
-    found = extend_tracks(both, np.array([0, 1]), seen, np.ones(1, bool), forward=True)
-    assert found.track.tolist() == [0]
+    tracks, _, _ = extend_tracks(both, np.array([0, 1]), seen, np.ones(1, bool), forward=True)
+    assert tracks.tolist() == [0]
 
 
 def test_a_gap_is_filled_on_the_way_and_goes_through_what_fills_it() -> None:

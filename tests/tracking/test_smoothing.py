@@ -25,7 +25,7 @@ def test_it_is_the_least_squares_of_the_whole_track() -> None:
     time_s = np.cumsum(rng.choice([0.2, 0.3, 0.4], 40))
     seen = np.column_stack([8 * time_s, 0.2 * time_s**2]) + rng.normal(0, 0.4, (40, 2))
     errors = PositionErrors(0.2, 0.4, 1.1)
-    found = smooth_paths(np.array([0, 25, 40]), time_s, seen, errors).xy_m
+    found = smooth_paths(np.array([0, 25, 40]), time_s, seen, errors)[0]
     for rows in (slice(0, 25), slice(25, 40)):
         t = time_s[rows]
         n, precision = len(t), np.linalg.inv(covariance(errors, t))
@@ -47,10 +47,10 @@ def test_errors_are_measured_and_made_smaller(noise: Noise) -> None:
     errors = measure_errors(tracks.first, tracks.time_s, seen)
     assert errors is not None
     assert errors.total_m == pytest.approx(np.hypot(noise.white_m, noise.lasting_m), rel=0.35)
-    smoothed = smooth_paths(tracks.first, tracks.time_s, seen, errors)
-    left, before = (float(np.sqrt(np.mean((xy - tracks.xy_m) ** 2))) for xy in (smoothed.xy_m, seen))
+    smoothed, position_sd_m, _ = smooth_paths(tracks.first, tracks.time_s, seen, errors)
+    left, before = (float(np.sqrt(np.mean((xy - tracks.xy_m) ** 2))) for xy in (smoothed, seen))
     assert left < (0.95 if noise.lasting_m else 0.6) * before
-    assert 0.6 * left < smoothed.position_sd_m < 1.9 * left
+    assert 0.6 * left < position_sd_m < 1.9 * left
 
 
 def test_a_vehicle_that_stands_is_at_one_place() -> None:
@@ -61,7 +61,7 @@ def test_a_vehicle_that_stands_is_at_one_place() -> None:
     errors = PositionErrors(0.05, 0.3, 1.0)
     seen = true + rng.normal(size=(2, len(time_s))).T @ np.diag([0.05, 0.05])
     seen += np.linalg.cholesky(covariance(errors, time_s)) @ rng.normal(size=true.shape)
-    found = smooth_paths(np.array([0, len(time_s)]), time_s, seen, errors).xy_m
+    found = smooth_paths(np.array([0, len(time_s)]), time_s, seen, errors)[0]
     waits = (time_s > 16) & (time_s < 26)
     assert np.ptp(seen[waits], axis=0).min() > 0.5
     assert np.ptp(found[waits], axis=0).max() < 0.02
@@ -93,7 +93,7 @@ def test_of_few_positions_nothing_is_known() -> None:
 def test_tracks_do_not_touch_each_other() -> None:
     tracks = driven()
     seen, errors = add_noise(tracks, Noise(0.3, 0.3, 1.0), seed=2), PositionErrors(0.3, 0.3, 1.0)
-    whole = smooth_paths(tracks.first, tracks.time_s, seen, errors).xy_m
+    whole = smooth_paths(tracks.first, tracks.time_s, seen, errors)[0]
     a, b = int(tracks.first[5]), int(tracks.first[6])
-    alone = smooth_paths(np.array([0, b - a]), tracks.time_s[a:b], seen[a:b], errors).xy_m
+    alone = smooth_paths(np.array([0, b - a]), tracks.time_s[a:b], seen[a:b], errors)[0]
     assert np.abs(whole[a:b] - alone).max() < 1e-5

@@ -136,7 +136,7 @@ def test_any_chunking_gives_the_same_tracklets(cuts: set[int]) -> None:
         part = [SHORT.tables[i] for i in reads]
         rows, counts = link_windows(part, TrackingConfig(), gsd_m=None, starts=starts)
         tables.append(rows)
-        log = log + counts
+        log.update(counts)
     pd.testing.assert_frame_equal(pd.concat(tables, ignore_index=True), WHOLE[0], check_exact=True)
     assert {k: v for k, v in log.items() if v} == {k: v for k, v in WHOLE[1].items() if v}
 

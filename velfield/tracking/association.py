@@ -44,7 +44,7 @@ class FrameTable:
         (n,) as in the detections' table. Orientations may be NaN.
     patches
         (n, length, width) uint8 oriented patches in working px; None: appearance is not used.
-    chips
+    crops
         (n, 32, 32) uint8 upright crops in working px, centred on ``round(x_work), round(y_work)``; None: displacements
         are not refined.
     x_work, y_work
@@ -267,11 +267,11 @@ def _frame_displacements(
     unrefined = np.stack([x, y, np.full(x.size, noise), np.zeros(x.size)], axis=1)
     if crops_before is None or crops_after is None:
         return unrefined
-    aligned = refine_links(crops_before, crops_after, first, second)
+    aligned_x, aligned_y, aligned_sd = refine_links(crops_before, crops_after, first, second)
     # Crops that align far from the detections' displacement match something else: a road marking, a neighbour.
-    near = np.hypot(aligned.x_px - x, aligned.y_px - y) <= limits.jitter_sigmas * noise
-    sd = np.sqrt(aligned.sd_px**2 + before.registration_sd_px**2 + after.registration_sd_px**2)
-    refined = np.stack([aligned.x_px, aligned.y_px, sd, np.ones(x.size)], axis=1)
+    near = np.hypot(aligned_x - x, aligned_y - y) <= limits.jitter_sigmas * noise
+    sd = np.sqrt(aligned_sd**2 + before.registration_sd_px**2 + after.registration_sd_px**2)
+    refined = np.stack([aligned_x, aligned_y, sd, np.ones(x.size)], axis=1)
     return np.where(near[:, None], refined, unrefined)
 
 
@@ -285,29 +285,10 @@ MIN_TYPICAL_DIFFERENCE = 2.0
 """Appearance difference of camera noise alone, grey levels."""
 
 
-@dataclass(frozen=True)
-class Triples:
-    """Candidate tracklets of one window.
-
-    Attributes
-    ----------
-    detections
-        (m, 3) index of the detection in each of the three frames.
-    cost
-        (m,) negative log-likelihood of appearance and motion, up to a constant.
-    """
-
-    detections: IntArray
-    cost: FloatArray
-
-
 def typical_difference(differences: FloatArray, first: IntArray) -> float:
     """Typical appearance difference of a car to itself: the median over detections of the smallest of their links'.
 
-    Parameters
-    ----------
-    differences, first
-        (m,) of each candidate link: appearance difference (NaN: unknown), and its earlier detection.
+    ``differences``, ``first`` (m,): appearance difference of each candidate link (NaN: unknown), its earlier detection.
     """
     known = np.isfinite(differences)
     if not known.any():
@@ -322,13 +303,14 @@ def appearance_cost(differences: FloatArray, typical: float) -> FloatArray:
     return np.where(np.isfinite(differences), APPEARANCE_EXPONENT * np.log1p(differences / typical), 0.0)
 
 
-def best_triples(triples: Triples, counts: tuple[int, int, int]) -> tuple[Mask, FloatArray]:
-    """Mask of the triples that are mutual best, and the confidence of each.
+def best_triples(detections: IntArray, cost: FloatArray, counts: tuple[int, int, int]) -> tuple[Mask, FloatArray]:
+    """Mask of the candidate triples of one window that are mutual best, and the confidence of each.
 
     Parameters
     ----------
-    triples
-        Candidate tracklets of one window.
+    detections, cost
+        (m, 3) index of the detection in each of the three frames, and (m,) negative log-likelihood of appearance and
+        motion, up to a constant.
     counts
         Number of detections in each of the three frames.
 
@@ -338,10 +320,10 @@ def best_triples(triples: Triples, counts: tuple[int, int, int]) -> tuple[Mask, 
         Mutual best: no other triple through any of its detections is as cheap. Confidence in [0, 1]: its likelihood
         over the sum of its own, its competitors' and a false alarm's.
     """
-    likelihood = np.exp(-triples.cost)
-    best, competitors = np.ones(triples.cost.size, np.bool_), np.zeros(triples.cost.size)
-    for column, count in zip(triples.detections.T, counts, strict=True):
-        best &= _is_least_alone(triples.cost, column)
+    likelihood = np.exp(-cost)
+    best, competitors = np.ones(cost.size, np.bool_), np.zeros(cost.size)
+    for column, count in zip(detections.T, counts, strict=True):
+        best &= _is_least_alone(cost, column)
         total = np.bincount(column, likelihood, count)
         competitors += np.maximum(total[column] - likelihood, 0.0)
     return best, likelihood / (likelihood + competitors + np.exp(-FALSE_ALARM_COST))
@@ -359,9 +341,7 @@ def mutual_best_links(differences: FloatArray, first: IntArray, second: IntArray
     """Cross-check (paper: tracking): links whose two detections are each most similar in appearance to the other;
     of two equal differences neither is.
 
-    Parameters
-    ----------
-    differences, first, second
-        (m,) of each candidate link: appearance difference, its earlier and its later detection.
+    ``differences``, ``first``, ``second`` (m,): appearance difference of each candidate link, its earlier and its later
+    detection.
     """
     return _is_least_alone(differences, first) & _is_least_alone(differences, second)

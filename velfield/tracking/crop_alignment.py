@@ -20,6 +20,7 @@ deviation.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -112,8 +113,7 @@ class UprightCrops:
         return prepare_crops(self.pixels, self.axis_rad)
 
 
-@dataclass(frozen=True)
-class AlignableCrops:
+class AlignableCrops(NamedTuple):
     """Crops prepared for alignment, n of them: all that does not depend on the other crop.
 
     Attributes
@@ -135,21 +135,10 @@ class AlignableCrops:
     pixels: NDArray[np.int16]
     counts: IntArray
 
-    def fields(self) -> tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray]:
-        """The arrays, in this order."""
-        return self.grey, self.weight, self.pixels, self.counts
 
-
-@dataclass(frozen=True)
-class Displacements:
-    """Displacements of links, base px; ``sd_px`` is NaN where the crops did not align."""
-
-    x_px: FloatArray
-    y_px: FloatArray
-    sd_px: FloatArray
-
-
-def refine_links(before: UprightCrops, after: UprightCrops, first: IntArray, second: IntArray) -> Displacements:
+def refine_links(
+    before: UprightCrops, after: UprightCrops, first: IntArray, second: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Displacement of each link from its two crops.
 
     Parameters
@@ -161,14 +150,14 @@ def refine_links(before: UprightCrops, after: UprightCrops, first: IntArray, sec
 
     Returns
     -------
-    Displacements
-        (k,) each; NaN where the crops do not align.
+    (k,) each, base px: displacement in x and y, and its standard deviation along either axis; NaN where the crops do
+    not align.
     """
     if before.scale != after.scale:
         # One detector, one working scale: another would change a car's size between the crops.
         raise ValueError(f"working scales {before.scale} and {after.scale} differ between linked frames")
     shift = align_prepared(before.prepared, after.prepared, first, second)
-    return Displacements(
+    return (
         after.centre_x_px[second] - before.centre_x_px[first] + shift[:, 0] / before.scale,
         after.centre_y_px[second] - before.centre_y_px[first] + shift[:, 1] / before.scale,
         shift[:, 2] / before.scale,
@@ -200,22 +189,9 @@ def _box_weights(axis_rad: FloatArray) -> Float32Array:
 
 
 def align_prepared(before: AlignableCrops, after: AlignableCrops, first: IntArray, second: IntArray) -> FloatArray:
-    """Shift of the car between pairs of crops, and its standard deviation.
-
-    Parameters
-    ----------
-    before, after
-        Crops of the earlier and the later frame.
-    first, second
-        (k,) index of each pair's crop in the earlier and the later frame.
-
-    Returns
-    -------
-    (k, 3) float64
-        Shift of the car from the earlier to the later crop in x and y, and its standard deviation along either axis,
-        working px; NaN where the crops do not align.
-    """
-    return np.asarray(_align_all(before.fields(), after.fields(), first, second, _SHIFTS), dtype=np.float64)
+    """(k, 3) shift of the car between pairs of crops in x and y, and its standard deviation, working px; otherwise as
+    `refine_links`."""
+    return np.asarray(_align_all(before, after, first, second, _SHIFTS), dtype=np.float64)
 
 
 @kernel
@@ -490,13 +466,9 @@ def _images() -> tuple[Float32Array, ...]:
 
 @kernel
 def _align_all(
-    before: tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray],
-    after: tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray],
-    first: IntArray,
-    second: IntArray,
-    shifts: IntArray,
+    before: AlignableCrops, after: AlignableCrops, first: IntArray, second: IntArray, shifts: IntArray
 ) -> FloatArray:
-    """`align_prepared`; ``before`` and ``after`` are the fields of `AlignableCrops`."""
+    """`align_prepared`."""
     grey_a, weight_a, pixels_a, counts_a = before
     grey_b, weight_b, _, counts_b = after
     out = np.full((first.size, 3), np.nan)

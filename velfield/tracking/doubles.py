@@ -68,12 +68,13 @@ def find_doubles(positions: pd.DataFrame, grey: pd.Series, metres: float) -> Int
     doubles: set[int] = set()
     part, _, both_seen = _count_seen(pairs)
     for k in np.flatnonzero(both_seen >= _MIN_FRAMES).tolist():
-        rows = pairs.part(part[k], part[k + 1])
+        rows = pairs.take(np.arange(part[k], part[k + 1]))
         darker, brighter = sorted(rows.ids(), key=lambda track: (level.get(track, np.inf), -track))
         black = level.get(darker, np.nan) <= _BLACK * level.get(brighter, np.nan)
         long_enough = len(rows) >= _MIN_SHARE * min(count[darker], count[brighter])
         abreast_m = _BLACK_ABREAST_M if black else _ABREAST_M
-        if long_enough and brighter not in doubles and _in_lockstep(rows.both_seen(), abreast_m):
+        both = rows.take(np.flatnonzero(rows.seen == 2))
+        if long_enough and brighter not in doubles and _in_lockstep(both, abreast_m):
             doubles.add(darker)
     return np.array(sorted(doubles), np.int64)
 
@@ -109,7 +110,7 @@ def find_split_tracks(positions: pd.DataFrame, metres: float) -> pd.Series:
     possible = (np.diff(part) >= _MIN_FRAMES) & (both_seen <= _MAX_SEEN_SHARE * np.diff(part)) & (one_seen > 0)
     track, frame = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
     found = []
-    for rows in (pairs.part(part[k], part[k + 1]) for k in np.flatnonzero(possible)):
+    for rows in (pairs.take(np.arange(part[k], part[k + 1])) for k in np.flatnonzero(possible)):
         both = rows.ids()
         first, second = (frame[slice(*np.searchsorted(track, [number, number + 1]))] for number in both)
         if _in_one_place(rows).sum() >= max(_SPLIT_SHARE * len(np.intersect1d(first, second)), _MIN_FRAMES):
@@ -147,17 +148,8 @@ class _Pairs:
     def __len__(self) -> int:
         return len(self.one)
 
-    def part(self, begin: int, end: int) -> "_Pairs":
-        """Rows from one to another."""
-        rows = slice(begin, end)
-        xy_m, offset_m = self.xy_m[:, rows], self.offset_m[:, rows]
-        return _Pairs(self.one[rows], self.other[rows], self.time_s[rows], xy_m, offset_m, self.seen[rows])
-
-    def both_seen(self) -> "_Pairs":
-        """The rows in which both are seen."""
-        rows = np.flatnonzero(self.seen == 2)
-        xy_m, offset_m = np.take(self.xy_m, rows, axis=1), np.take(self.offset_m, rows, axis=1)
-        return _Pairs(self.one[rows], self.other[rows], self.time_s[rows], xy_m, offset_m, self.seen[rows])
+    def take(self, rows: IntArray) -> "_Pairs":
+        return _Pairs(*(np.take(getattr(self, name), rows, axis=-1) for name in self.__dataclass_fields__))
 
     def ids(self) -> tuple[int, int]:
         """Both tracks, of rows of one pair."""

@@ -10,8 +10,8 @@ A rejected candidate is counted once, at the first gate that it fails (`GateLog`
 Limits of the gates in base pixels and seconds, and the counts of candidates that each gate rejects.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,9 +71,8 @@ class Limits:
         return float(np.hypot(self.jitter_px, residual_px))
 
 
-@dataclass
-class GateLog(Mapping[str, int]):
-    """Counts by gate; logs of disjoint sets of windows add up to the log of their union.
+class GateLog(Counter[str]):
+    """Counts by gate; those of disjoint sets of windows add up to those of their union.
 
     Links of every pair of consecutive frames: ``links_tried`` (within twice the reach), of which rejected by
     ``speed``, ``axis``, and, with ``linking = pairwise``, ``appearance`` (not the mutual best in appearance). Pairs of
@@ -83,27 +82,6 @@ class GateLog(Mapping[str, int]):
     candidates are part of; and of the links of both, two each, ``links_refined`` and ``links_not_refined``
     (displacement not from the crops).
     """
-
-    counts: dict[str, int] = field(default_factory=dict)
-
-    def add(self, gate: str, count: int) -> None:
-        """Add to the count of one gate."""
-        self.counts[gate] = self.counts.get(gate, 0) + int(count)
-
-    def __add__(self, other: "GateLog") -> "GateLog":
-        total = GateLog(dict(self.counts))
-        for gate, count in other.items():
-            total.add(gate, count)
-        return total
-
-    def __getitem__(self, gate: str) -> int:
-        return self.counts.get(gate, 0)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.counts)
-
-    def __len__(self) -> int:
-        return len(self.counts)
 
 
 DEFAULT_AXIS_SD_RAD = 0.1
@@ -169,17 +147,7 @@ class Links:
 def gate_links(before: DetectionStates, after: DetectionStates, limits: Limits) -> Links:
     """Candidate links: all pairs of detections of two frames that pass the gates on speed and axis.
 
-    Parameters
-    ----------
-    before, after
-        Detections of the earlier and of the later frame.
-    limits
-        Limits of the gates.
-
-    Returns
-    -------
-    Links
-        Sorted by the earlier detection, then the later one.
+    ``before``, ``after``: detections of the earlier and of the later frame.
     """
     interval = after.time_s - before.time_s
     noise = float(np.hypot(before.sd_px, after.sd_px))
@@ -258,14 +226,8 @@ def gate_link_pairs(
 ) -> LinkPairs:
     """All pairs of consecutive links that pass the gates on turn and acceleration.
 
-    Parameters
-    ----------
-    states
-        Detections of the three frames of the window.
-    before, after
-        Links from the first frame to the middle one, and from the middle one to the last.
-    limits
-        Limits of the gates.
+    ``states``: detections of the three frames. ``before``, ``after``: links from the first frame to the middle one, and
+    from the middle one to the last.
     """
     begins = np.searchsorted(after.first, np.arange(states[1].x_px.size + 1))
     link_01, link_12 = _expand(begins[before.second], begins[before.second + 1])

@@ -351,14 +351,7 @@ def _neighbourhood(end, start, beside, partner, gains, at) -> tuple[FloatArray, 
 def assign_tracks(detection_ids: IntArray) -> IntArray:
     """The track of each tracklet: the smallest detection id of its connected component.
 
-    Parameters
-    ----------
-    detection_ids
-        (n, 3) ids of each tracklet's detections. Tracklets that share a detection belong to one track.
-
-    Returns
-    -------
-    (n,) int64
+    ``detection_ids`` (n, 3) of each tracklet; those that share a detection belong to one track.
 
     Examples
     --------

@@ -91,9 +91,9 @@ def recover_tracks(
     first = close_gaps(ids, ends, starts, limits, context)
     open_end, open_start = ~np.isin(ids, first.joins["before"]), ~np.isin(ids, first.joins["after"])
     moving = [np.hypot(*one.velocity_m_per_s.T) > limits.stationary_speed_m_per_s for one in (ends, starts)]
-    forward = extend_tracks(ends, np.flatnonzero(open_end & moving[0]), candidates, free, forward=True)
-    backward = extend_tracks(starts, np.flatnonzero(open_start & moving[1]), candidates, free, forward=False)
-    ends, starts = forward.ends, backward.ends
+    which_ends, which_starts = np.flatnonzero(open_end & moving[0]), np.flatnonzero(open_start & moving[1])
+    onward, found_onward, ends = extend_tracks(ends, which_ends, candidates, free, forward=True)
+    back, found_back, starts = extend_tracks(starts, which_starts, candidates, free, forward=False)
     second = close_gaps(ids, ends, starts, limits, context, open_end=open_end, open_start=open_start)
     joins = pd.concat([first.joins, second.joins], ignore_index=True)
     before, after = (np.searchsorted(ids, joins[name].to_numpy(np.int64)) for name in ("before", "after"))
@@ -108,27 +108,20 @@ def recover_tracks(
         )
         gaps.append(replace(gap, filled=fill_gap(gap, candidates, free)))
     joins = joins.assign(track_id=tracks[before], end_time_s=ends.time_s[before], start_time_s=starts.time_s[after])
-    chain = np.concatenate([forward.track, backward.track])
+    chain = np.concatenate([onward, back])
     filled = [np.full(len(gap.filled), gap.track_id) for gap in gaps]
     return Recovered(
         tracks,
         joins.sort_values(["end_time_s", "before"], ignore_index=True),
         np.concatenate([tracks[chain], *filled]).astype(np.int64),
-        np.concatenate([forward.candidate, backward.candidate, *(gap.filled for gap in gaps)]).astype(np.int64),
+        np.concatenate([found_onward, found_back, *(gap.filled for gap in gaps)]).astype(np.int64),
         gaps,
     )
 
 
-@dataclass(frozen=True)
-class Extension:
-    """Candidates (k,) that extend tracks (k,), by their indices, and the ends (or starts) that result."""
-
-    track: IntArray
-    candidate: IntArray
-    ends: TrackEnds
-
-
-def extend_tracks(ends: TrackEnds, which: IntArray, candidates: Candidates, free: Mask, *, forward: bool) -> Extension:
+def extend_tracks(
+    ends: TrackEnds, which: IntArray, candidates: Candidates, free: Mask, *, forward: bool
+) -> tuple[IntArray, IntArray, TrackEnds]:
     """Extend the ends of tracks forward, or their starts backward, from frame to frame.
 
     Parameters
@@ -139,6 +132,11 @@ def extend_tracks(ends: TrackEnds, which: IntArray, candidates: Candidates, free
         Indices of the tracks to extend.
     free
         (candidates,) whether each may be used; those that are used are cleared.
+
+    Returns
+    -------
+    (k,), (k,), TrackEnds
+        Tracks and the candidates that extend them, by their indices, and the ends (or starts) that result.
     """
     sign = 1 if forward else -1
     time, place, velocity = ends.time_s.copy(), ends.position_m.copy(), ends.velocity_m_per_s.copy()
@@ -171,7 +169,7 @@ def extend_tracks(ends: TrackEnds, which: IntArray, candidates: Candidates, free
         taken.append(found)
     nothing = [np.empty(0, np.int64)]
     result = replace(ends, time_s=time, position_m=place, velocity_m_per_s=velocity, frame=frame)
-    return Extension(np.concatenate(nothing + tracks), np.concatenate(nothing + taken), result)
+    return np.concatenate(nothing + tracks), np.concatenate(nothing + taken), result
 
 
 def _match(

@@ -132,22 +132,12 @@ def clean_tracks(track: IntArray, time_s: FloatArray, xy_m: FloatArray) -> Clean
     cuts = int(jumps.sum())
     if errors is None or errors.total_m < LEAST_ERROR_M:
         return CleanTracks(track, xy_m, None, 0.0, 0.0, cuts)
-    paths = smooth_paths(first, time_s, xy_m, errors)
-    return CleanTracks(track, paths.xy_m, errors, paths.position_sd_m, paths.velocity_sd_m_per_s, cuts)
+    smoothed, position_sd_m, velocity_sd_m_per_s = smooth_paths(first, time_s, xy_m, errors)
+    return CleanTracks(track, smoothed, errors, position_sd_m, velocity_sd_m_per_s, cuts)
 
 
 def _first_rows(track: IntArray) -> IntArray:
     return np.asarray(np.r_[0, np.flatnonzero(np.diff(track)) + 1, len(track)], np.int64)
-
-
-@dataclass(frozen=True)
-class SmoothedPaths:
-    """Smoothed positions ``xy_m`` (m, 2), and the standard deviations along one axis, in the middle of a long track:
-    of a position, ``position_sd_m``, and of a velocity, ``velocity_sd_m_per_s``."""
-
-    xy_m: FloatArray
-    position_sd_m: float
-    velocity_sd_m_per_s: float
 
 
 def measure_errors(first: IntArray, time_s: FloatArray, xy_m: FloatArray) -> PositionErrors | None:
@@ -247,14 +237,19 @@ def _contrasts(n: int, degree: int) -> FloatArray:
     return np.asarray(np.linalg.qr(np.column_stack([powers, cosines]))[0][:, degree + 1 : n])
 
 
-def smooth_paths(first: IntArray, time_s: FloatArray, xy_m: FloatArray, errors: PositionErrors) -> SmoothedPaths:
-    """Smooth the positions of tracks (as of `measure_errors`) that have these errors."""
+def smooth_paths(
+    first: IntArray, time_s: FloatArray, xy_m: FloatArray, errors: PositionErrors
+) -> tuple[FloatArray, float, float]:
+    """Smoothed positions (m, 2) of tracks (as of `measure_errors`) that have these errors.
+
+    Also the standard deviations along one axis in the middle of a long track: of a position, m, and of a velocity, m/s.
+    """
     position, velocity, slow = _deviations(first, time_s, errors)
     out = _solve(first, time_s, xy_m, errors, np.zeros(len(xy_m), bool))
     stands = _find_stands(first, time_s, out, position, slow)
     if stands.any():
         out = _solve(first, time_s, xy_m, errors, stands)
-    return SmoothedPaths(out, position, velocity)
+    return out, position, velocity
 
 
 def _solve(first: IntArray, time_s: FloatArray, xy_m: FloatArray, errors: PositionErrors, stands: Mask) -> FloatArray:

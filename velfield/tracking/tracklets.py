@@ -24,7 +24,6 @@ from velfield.tracking.association import (
     MAX_COST,
     FrameTable,
     LinkedTriples,
-    Triples,
     appearance_cost,
     best_triples,
     mutual_best_links,
@@ -139,7 +138,7 @@ def link_windows(
     _check_order(tables)
     limits = Limits.from_config(config, gsd_m)
     log = GateLog()
-    log.add("frames_not_registered", sum(not t.registered and t.frame in starts for t in tables))
+    log["frames_not_registered"] += sum(not t.registered and t.frame in starts for t in tables)
     good = _Frames([t for t in tables if t.registered], limits, config)
     every = [t.with_weak(one) for t, one in zip(tables, weak, strict=True) if t.registered] if weak else good.tables
     triples: list[LinkedTriples] = []
@@ -147,11 +146,11 @@ def link_windows(
         if table.frame not in starts:
             continue
         if not good.adjacent(i):
-            log.add("gaps_too_long", 1)
+            log["gaps_too_long"] += 1
             continue
         pair = good.pair(i)
         for gate, count in zip(("links_tried", "speed", "axis", "appearance"), pair.rejected, strict=True):
-            log.add(gate, count)
+            log[gate] += count
         if i + 2 < len(good.tables) and good.adjacent(i + 1):
             triples.append(_select_triples(i, good, config.min_confidence, log))
             if weak:
@@ -159,8 +158,8 @@ def link_windows(
                 triples.append(_select_moving(every, triples[-1], good, stands_px, log))
         good.release(i)
     rows, refined = tracklet_table(every, triples, limits, refine=config.refine)
-    log.add("links_refined", refined)
-    log.add("links_not_refined", 2 * len(rows) - refined)
+    log["links_refined"] += refined
+    log["links_not_refined"] += 2 * len(rows) - refined
     return rows, log
 
 
@@ -178,27 +177,28 @@ def _check_order(tables: Sequence[FrameTable]) -> None:
 def _select_triples(start: int, frames: _Frames, min_confidence: float, log: GateLog) -> LinkedTriples:
     """Gate the pairs of links of the window that starts at ``start``, and select the tracklets among them."""
     pairs, triples, best, confidence = _link_window(start, frames)
-    log.add("windows", 1)
+    log["windows"] += 1
     for gate, count in zip(("pairs_tried", "turn", "acceleration"), pairs.rejected, strict=True):
-        log.add(gate, count)
+        log[gate] += count
     accepted = best & (confidence >= min_confidence)
-    log.add("not_best", int(np.sum(~best)))
-    log.add("confidence", int(np.sum(best & ~accepted)))
-    log.add("tracklets", int(np.sum(accepted)))
-    selected = np.flatnonzero(accepted)[np.argsort(triples.detections[accepted, 1], kind="stable")]
+    log["not_best"] += int(np.sum(~best))
+    log["confidence"] += int(np.sum(best & ~accepted))
+    log["tracklets"] += int(np.sum(accepted))
+    selected = np.flatnonzero(accepted)[np.argsort(triples[accepted, 1], kind="stable")]
     differences = np.stack(
         [frames.pair(start).differences[pairs.link_01], frames.pair(start + 1).differences[pairs.link_12]], axis=1
     )
-    return LinkedTriples(start, triples.detections[selected], differences[selected], confidence[selected])
+    return LinkedTriples(start, triples[selected], differences[selected], confidence[selected])
 
 
-def _link_window(start: int, frames: _Frames) -> tuple[LinkPairs, Triples, Mask, FloatArray]:
-    """Pairs of links of the window that starts at ``start``, and its triples: which are best, and how likely."""
+def _link_window(start: int, frames: _Frames) -> tuple[LinkPairs, IntArray, Mask, FloatArray]:
+    """Pairs of links of the window that starts at ``start``, and its triples (m, 3): which are best, and how likely."""
     before, after = frames.pair(start), frames.pair(start + 1)
     states = (frames.states[start], frames.states[start + 1], frames.states[start + 2])
     pairs = gate_link_pairs(states, before.links, after.links, frames.limits)
-    triples = _triples(frames.features(start), frames.features(start + 2), before, after, pairs)
-    return pairs, triples, *best_triples(triples, (states[0].x_px.size, states[1].x_px.size, states[2].x_px.size))
+    triples, cost = _triples(frames.features(start), frames.features(start + 2), before, after, pairs)
+    counts = states[0].x_px.size, states[1].x_px.size, states[2].x_px.size
+    return pairs, triples, *best_triples(triples, cost, counts)
 
 
 def _select_moving(
@@ -216,13 +216,13 @@ def _select_moving(
     rows = [np.setdiff1d(movable[k], selected.detections[:, k]) for k in range(3)]
     left = _Frames([t.take(one) for t, one in zip(window, rows, strict=True)], frames.limits, frames.config)
     _, triples, best, likely = _link_window(0, left)
-    found = np.stack([rows[k][triples.detections[:, k]] for k in range(3)], axis=1)
+    found = np.stack([rows[k][triples[:, k]] for k in range(3)], axis=1)
     moved_px = np.hypot(*(places[2][found[:, 2]] - places[0][found[:, 0]]).T)
     score = np.mean([window[k].score[found[:, k]] for k in range(3)], axis=0)
     confidence = _moving_vehicle(score, likely)
     accepted = best & (moved_px > 2 * stands_px) & (confidence >= frames.config.min_confidence)
     accepted &= ~_meet_others(trees, found, stands_px)
-    log.add("moving_candidates", int(np.sum(accepted)))
+    log["moving_candidates"] += int(np.sum(accepted))
     chosen = np.flatnonzero(accepted)[np.argsort(found[accepted, 1], kind="stable")]
     nothing = np.full((len(chosen), 2), np.nan)
     return LinkedTriples(selected.start, found[chosen], nothing, confidence[chosen])
@@ -261,7 +261,8 @@ def _moving_vehicle(score: FloatArray, likely: FloatArray) -> FloatArray:
 
 def _triples(
     first: AppearanceFeatures, last: AppearanceFeatures, before: _FramePair, after: _FramePair, pairs: LinkPairs
-) -> Triples:
+) -> tuple[IntArray, FloatArray]:
+    """(m, 3) detections and (m,) cost, as of `best_triples`."""
     a = before.links.first[pairs.link_01]
     b = before.links.second[pairs.link_01]
     c = after.links.second[pairs.link_12]
@@ -275,4 +276,4 @@ def _triples(
     )
     likely = cost < MAX_COST  # a triple that two pairs rule out needs no third
     cost[likely] += appearance_cost(appearance_differences(first, last, a[likely], c[likely]), typical)
-    return Triples(np.stack([a, b, c], axis=1), cost)
+    return np.stack([a, b, c], axis=1), cost
