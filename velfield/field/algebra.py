@@ -3,8 +3,7 @@
 The field of a whole is the sum of the fields of its parts as long as no track is split between parts.
 """
 
-from collections.abc import Sequence
-from functools import reduce
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,10 @@ def merge_tiles(tiles: Sequence[FieldTile]) -> FieldTile:
     """
     if not tiles:
         raise ValueError("merge_tiles needs at least one tile")
-    return reduce(_add, tiles)
+    total = tiles[0]
+    for tile in tiles[1:]:
+        total = FieldTile(*(_sum(a, b, name) for a, b, name in _layers(total, tile)))
+    return total
 
 
 def subtract_tile(whole: FieldTile, part: FieldTile) -> FieldTile:
@@ -43,15 +45,20 @@ def subtract_tile(whole: FieldTile, part: FieldTile) -> FieldTile:
     InputError
         The tiles differ in shape, or ``part`` exceeds ``whole``, so is no part of it.
     """
-    return FieldTile(*(_difference(a, b, name) for a, b, name in zip(whole, part, FieldTile._fields, strict=True)))
+    return FieldTile(*(_difference(a, b, name) for a, b, name in _layers(whole, part)))
 
 
-def _add(a: FieldTile, b: FieldTile) -> FieldTile:
-    return FieldTile(*(_sum(x, y, name) for x, y, name in zip(a, b, FieldTile._fields, strict=True)))
+def _layers(one: FieldTile, other: FieldTile) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], str]]:
+    """The layers of two tiles, and their names."""
+    for a, b, name in zip(one, other, FieldTile._fields, strict=True):
+        if a.shape != b.shape:
+            raise InputError(
+                f"the fields' {name} differ in shape, {a.shape} and {b.shape}: they must share grid and bins"
+            )
+        yield a, b, name
 
 
 def _sum(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> NDArray[np.int32]:
-    _same_shape(a, b, name)
     # Neither is negative, so a sum that overflows is below a summand.
     total = a + b
     if (total < a).any():
@@ -60,15 +67,9 @@ def _sum(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> NDArray[np.in
 
 
 def _difference(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> NDArray[np.int32]:
-    _same_shape(a, b, name)
     if (b > a).any():
         raise InputError(
             f"the field to subtract holds more {name} than the whole at {int((b > a).sum())} positions: "
             "it is no part of it; subtract a field that was merged into this one"
         )
     return a - b
-
-
-def _same_shape(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> None:
-    if a.shape != b.shape:
-        raise InputError(f"the fields' {name} differ in shape, {a.shape} and {b.shape}: they must share grid and bins")

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
+from velfield.field.accumulate import FieldTile
 from velfield.field.modes import velocity_modes
 from velfield.field.segments import VelocityBins
 from velfield.field.statistics import TileStatistics
@@ -80,24 +80,20 @@ class PixelDistribution:
 
 
 def describe_pixel(
-    x: int,
-    y: int,
-    histogram: NDArray[np.int32],
-    count: NDArray[np.int32],
-    bins: VelocityBins,
-    statistics: TileStatistics,
+    x: int, y: int, pixel: FieldTile, bins: VelocityBins, statistics: TileStatistics
 ) -> PixelDistribution:
-    """The distribution of a tile of one pixel, (1, 1, nvy, nvx) and (1, 1), with given statistics."""
-    modes = velocity_modes(histogram, count, bins=bins)[0, 0]
-    total = int(histogram.sum(dtype=np.int64))
+    """The distribution of a tile of one pixel, with given statistics."""
+    modes = velocity_modes(pixel.histogram, pixel.count, bins=bins)[0, 0]
+    modal, half = statistics.modal_velocity_px_per_s[0, 0], float(statistics.direction_half_width_rad[0, 0])
+    direction = float(np.arctan2(modal[1], modal[0]))
     return PixelDistribution(
         x=x,
         y=y,
-        n=int(count[0, 0]),
+        n=int(pixel.count[0, 0]),
         bins=bins,
-        weights=histogram[0, 0] / max(total, 1),
+        weights=pixel.histogram[0, 0] / max(int(pixel.histogram.sum(dtype=np.int64)), 1),
         modes=modes[np.isfinite(modes[:, 2])],
-        modal_velocity_px_per_s=statistics.modal_velocity_px_per_s[0, 0],
+        modal_velocity_px_per_s=modal,
         mean_velocity_px_per_s=statistics.mean_velocity_px_per_s[0, 0],
         percentiles_px_per_s=dict(
             zip((15, 50, 85), map(float, statistics.speed_percentiles_px_per_s[0, 0]), strict=True)
@@ -107,16 +103,9 @@ def describe_pixel(
         entropy_nats=float(statistics.entropy_nats[0, 0]),
         direction_se_rad=float(statistics.direction_se_rad[0, 0]),
         speed_se_px_per_s=float(statistics.speed_se_px_per_s[0, 0]),
-        direction_interval_rad=_direction_interval(statistics),
+        direction_interval_rad=(direction - half, direction + half),
         median_speed_interval_px_per_s=(
             float(statistics.median_speed_low_px_per_s[0, 0]),
             float(statistics.median_speed_high_px_per_s[0, 0]),
         ),
     )
-
-
-def _direction_interval(statistics: TileStatistics) -> tuple[float, float]:
-    """The 90 % interval of the modal direction of a tile of one pixel, rad."""
-    vx, vy = statistics.modal_velocity_px_per_s[0, 0]
-    direction, half = float(np.arctan2(vy, vx)), float(statistics.direction_half_width_rad[0, 0])
-    return direction - half, direction + half

@@ -324,7 +324,6 @@ def tile_statistics(
     *,
     bins: VelocityBins,
     stationary_speed_px_per_s: float,
-    percentiles: tuple[float, ...] = PERCENTILES,
 ) -> TileStatistics:
     """All statistics of a tile.
 
@@ -338,14 +337,12 @@ def tile_statistics(
         (ty, tx) int32, as in `FieldTile`.
     stationary_speed_px_per_s
         Below it there is no direction, nor below a bin and a half.
-    percentiles
-        Percentiles of speed to compute, %.
     """
-    values = (2, 7, len(percentiles), 3, 2)
+    values = (2, 7, len(PERCENTILES), 3, 2)
     found = _Tile(*(np.full((*count.shape, n), np.nan) for n in values))
     variance_bins2 = variance_sum / (np.maximum(count, 1) * float(VARIANCE_UNIT))
     stationary = stationary_speed_px_per_s / bins.width_px_per_s
-    limits = np.asarray(percentiles, np.float64)
+    limits = np.array(PERCENTILES)
     _tile(histogram, count, variance_bins2, stationary, bins.kernel_sigma_bins, limits, found)
     return TileStatistics(
         n=count,

@@ -116,14 +116,12 @@ class VelocityField:
     def modal_velocity(self) -> Float32Array:
         """(y, x, 2) float32 velocity of the highest mode as (vx, vy) px/s; NaN where no vehicle passed."""
         if self._modal is None:
-            out = np.full((*self.shape, 2), np.nan, np.float32)
+            modal = np.full((*self.shape, 2), np.nan, np.float32)
             if self._layers is not None:
-                out[..., 0], out[..., 1] = self._layers("modal_vx"), self._layers("modal_vy")
-                self._modal = out
-                return out.copy()
-            for where, velocity in self._over_tiles(lambda t: modal_velocity(t.histogram, t.count, bins=self.bins)):
-                out[where] = velocity[: out[where].shape[0], : out[where].shape[1]]
-            self._modal = out
+                modal[..., 0], modal[..., 1] = self._layers("modal_vx"), self._layers("modal_vy")
+            else:
+                self._fill(modal, lambda t: modal_velocity(t.histogram, t.count, bins=self.bins))
+            self._modal = modal
         return self._modal.copy()
 
     def modal_direction_rad(self) -> FloatArray:
@@ -149,10 +147,7 @@ class VelocityField:
         """(y, x) number of tracks; 0 where no vehicle passed."""
         if self._layers is not None:
             return np.array(self._layers("count"), np.int32)
-        out = np.zeros(self.shape, np.int32)
-        for where, count in self._over_tiles(lambda t: t.count):
-            out[where] = count[: out[where].shape[0], : out[where].shape[1]]
-        return out
+        return self._fill(np.zeros(self.shape, np.int32), lambda t: t.count)
 
     def statistics(self) -> TileStatistics:
         """All statistics of every pixel, as whole maps in float32."""
@@ -168,6 +163,11 @@ class VelocityField:
                 target = maps[name][where]
                 target[...] = getattr(part, name)[: target.shape[0], : target.shape[1]]
         return TileStatistics(**maps)  # type: ignore[arg-type]  # float32 in place of float64: half the memory
+
+    def _fill(self, out: NDArray[Any], work: Callable[[FieldTile], NDArray[Any]]) -> NDArray[Any]:
+        for where, result in self._over_tiles(work):
+            out[where] = result[: out[where].shape[0], : out[where].shape[1]]
+        return out
 
     # -- a pixel ------------------------------------------------------------------------------------------------------
 
@@ -202,7 +202,7 @@ class VelocityField:
         return FieldTile(np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), *np.zeros((3, 1, 1), np.int32))
 
     def _distribution(self, x: int, y: int, pixel: FieldTile) -> PixelDistribution:
-        return describe_pixel(x, y, pixel.histogram, pixel.count, self.bins, self._tile_statistics(pixel))
+        return describe_pixel(x, y, pixel, self.bins, self._tile_statistics(pixel))
 
     # -- a prior for another tracker ----------------------------------------------------------------------------------
 
