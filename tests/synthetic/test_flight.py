@@ -133,10 +133,10 @@ def test_cars_of_the_truth_agree_with_its_transform(truth: Truth) -> None:
 def test_a_field_along_the_lanes_scores_perfectly_and_one_across_does_not(truth: Truth) -> None:
     h, w = truth.base_shape
     velocity, count = np.full((h, w, 2), np.nan), np.zeros((h, w), int)
-    steps = truth.segments()
-    at = np.rint(steps[["x_0_px", "y_0_px"]].to_numpy()).astype(int)
+    cars = truth.cars[truth.cars["visible"] & truth.cars["moving"]]
+    at = np.rint(cars[["x_base_px", "y_base_px"]].to_numpy()).astype(int)
     inside = (at >= 0).all(axis=1) & (at < [w, h]).all(axis=1)
-    velocity[at[inside, 1], at[inside, 0]] = steps.loc[inside, ["vx_px_per_s", "vy_px_per_s"]].to_numpy()
+    velocity[at[inside, 1], at[inside, 0]] = cars.loc[inside, ["vx_px_per_s", "vy_px_per_s"]].to_numpy()
     count[at[inside, 1], at[inside, 0]] = 5
     assert score_field(truth, velocity, count).fraction_within > 0.99
     across = np.stack([-velocity[..., 1], velocity[..., 0]], axis=-1)

@@ -12,7 +12,7 @@ from velfield.synthetic.cases import FLAT, PINHOLE, small_flight
 from velfield.synthetic.city.ground import NOON, reach_map
 from velfield.synthetic.city.relief import Relief, make_relief
 from velfield.synthetic.flight import Flight, _motion_kernel
-from velfield.synthetic.other_sensor import FAR_PX, StaticScene, other_sensor_image
+from velfield.synthetic.other_sensor import FAR_PX, other_sensor_image
 from velfield.synthetic.render import (
     MIN_OCCLUDER_PX,
     MOSAIC_SCALE,
@@ -211,14 +211,14 @@ def test_kinds_of_vehicle_have_their_own_outlines() -> None:
     assert all(0.85 * 19 * 8 < area < 1.02 * 19 * 8 for area in areas)
 
 
-def static_scene(tone: int) -> StaticScene:
+def static_scene(tone: int) -> SceneMaps:
     size = 80
-    return StaticScene(
+    return SceneMaps(
         np.full((MOSAIC_SCALE * size, MOSAIC_SCALE * size), tone, np.uint8),
         np.zeros((size, size), np.uint8),
         np.zeros((5, 5), np.uint8),
+        np.array([-8.0, -8.0]),
         0.4,
-        8,
     )
 
 

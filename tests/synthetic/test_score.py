@@ -263,17 +263,6 @@ def test_the_field_score_counts_pixels_with_enough_tracks() -> None:
     assert (empty.pixels, empty.fraction_within) == (0, 0.0)
 
 
-def test_segments_of_the_truth_are_between_consecutive_visible_frames() -> None:
-    rows = [car(frame, 0, 50.0 + 8 * frame, 40, 40.0) for frame in (0, 1, 3)]
-    rows += [car(frame, 1, 50.0 + 6 * frame, 80, 30.0, visible=frame != 1) for frame in range(3)]
-    rows += [car(frame, 2, 90.0, 120) for frame in range(3)]
-    found = truth(rows).segments()
-    assert found[["vehicle_id", "frame"]].to_numpy().tolist() == [[0, 0]]
-    row = found.iloc[0]
-    assert (row.x_0_px, row.x_1_px, row.vx_px_per_s) == pytest.approx((50.0, 58.0, 40.0))
-    assert truth(rows).segments(max_interval_s=0.1).empty
-
-
 def test_truth_is_read_back_as_written_also_with_the_old_name_of_the_position(tmp_path: Path) -> None:
     made = truth([*driving(0, 50, 40)], [EAST, NORTH])
     save_truth(made, tmp_path / "truth")

@@ -2,11 +2,7 @@
 
 import numpy as np
 
-from schemas.simulation import (
-    CameraSimulation,
-    SceneSimulation,
-    SimulationConfig,
-)
+from schemas.simulation import CameraSimulation, SceneSimulation, SimulationConfig
 from velfield.synthetic.camera import fold_radius
 from velfield.synthetic.flight import Flight
 

@@ -1,7 +1,5 @@
 """The base image: an orthographic view of the same ground, by another sensor, on another day, without traffic."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +7,7 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, GreyImage
 from schemas.simulation import OtherSensorSimulation
 from velfield.synthetic.city.ground import apply_light, light_map
-from velfield.synthetic.render import MOSAIC_SCALE, VehicleSprites, draw_vehicles
+from velfield.synthetic.render import MOSAIC_SCALE, SceneMaps, VehicleSprites, draw_vehicles
 from velfield.synthetic.traffic.traffic import draw_dimensions
 from velfield.synthetic.traffic.vehicles import draw_tones
 
@@ -17,20 +15,8 @@ FAR_PX = 1e8
 """Height of a camera whose rays are vertical to within rounding, base px."""
 
 
-@dataclass(frozen=True)
-class StaticScene:
-    """The scene without vehicles: ``tone`` mosaic, ``height`` and ``reach`` maps, base px a count, and the mosaic's
-    border, px."""
-
-    tone: GreyImage
-    height: GreyImage
-    reach: GreyImage
-    height_step_px: float
-    pad_px: int
-
-
 def other_sensor_image(
-    static: StaticScene,
+    static: SceneMaps,
     config: OtherSensorSimulation,
     *,
     shape: tuple[int, int],
@@ -40,11 +26,11 @@ def other_sensor_image(
     rng: np.random.Generator,
 ) -> GreyImage:
     """Image (shape) with its own illumination, blur, tone curve and noise, and cars at ``parked`` (n, 3) x, y,
-    direction."""
+    direction; the scene's mosaic is of tones, without light."""
     light = light_map(static.height, static.reach, step_px=static.height_step_px, direction=sun)
-    lit = apply_light(static.tone, light)
+    lit = apply_light(static.mosaic, light)
     blurred = cv2.GaussianBlur(lit, (0, 0), MOSAIC_SCALE * float(np.hypot(config.blur_px, 0.29)))
-    first = static.pad_px * MOSAIC_SCALE
+    first = -int(static.origin[0]) * MOSAIC_SCALE  # the border is as wide on all sides
     last_y, last_x = (first + n * MOSAIC_SCALE for n in shape)
     tones = np.ascontiguousarray(blurred[first:last_y:MOSAIC_SCALE, first:last_x:MOSAIC_SCALE], dtype=np.float32)
     _draw_parked(tones, parked, sun=sun, gsd_m=gsd_m, rng=rng)

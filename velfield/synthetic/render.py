@@ -65,17 +65,9 @@ def render_ground(  # type: ignore[no-untyped-def]
     f, cx, cy = pinhole[0], pinhole[1], pinhole[2]
     mh, mw = mosaic.shape
     for i in range(out.shape[0]):
-        r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
-            table[i, 0],
-            table[i, 1],
-            table[i, 2],
-            table[i, 3],
-            table[i, 4],
-            table[i, 5],
-            table[i, 6],
-            table[i, 7],
-            table[i, 8],
-        )
+        r0, r1, r2 = table[i, 0], table[i, 1], table[i, 2]
+        r3, r4, r5 = table[i, 3], table[i, 4], table[i, 5]
+        r6, r7, r8 = table[i, 6], table[i, 7], table[i, 8]
         px, py, pz = table[i, 9], table[i, 10], table[i, 11]
         z = 0.0
         for j in range(out.shape[1]):

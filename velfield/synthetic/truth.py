@@ -79,31 +79,6 @@ class Truth:
             _lower_errors(lane.path_px, reach_px, xy, direction_rad, error)
         return error
 
-    def segments(self, *, max_interval_s: float = 0.45) -> pd.DataFrame:
-        """True displacements from frame to frame: vehicle_id, frame, x_0, y_0, x_1, y_1 (base px), vx, vy px/s.
-
-        Only vehicles that are visible and moving in both frames: the segments of a perfect tracker.
-        """
-        cars = self.cars[self.cars["visible"] & self.cars["moving"]].sort_values(["vehicle_id", "frame"])
-        later = cars.shift(-1)
-        dt = later["time_s"] - cars["time_s"]
-        keep = (
-            (later["vehicle_id"] == cars["vehicle_id"]) & (later["frame"] == cars["frame"] + 1) & (dt < max_interval_s)
-        )
-        a, b, dt = cars[keep], later[keep], dt[keep]
-        return pd.DataFrame(
-            {
-                "vehicle_id": a["vehicle_id"],
-                "frame": a["frame"],
-                "x_0_px": a["x_base_px"],
-                "y_0_px": a["y_base_px"],
-                "x_1_px": b["x_base_px"],
-                "y_1_px": b["y_base_px"],
-                "vx_px_per_s": (b["x_base_px"] - a["x_base_px"]) / dt,
-                "vy_px_per_s": (b["y_base_px"] - a["y_base_px"]) / dt,
-            }
-        ).reset_index(drop=True)
-
 
 def make_truth(flight: Flight) -> Truth:
     """The ground truth of a flight in memory."""

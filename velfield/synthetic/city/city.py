@@ -12,7 +12,7 @@ from schemas.simulation import SimulationConfig
 from velfield.synthetic.city.city_plan import CityPlan, make_city_plan
 from velfield.synthetic.city.ground import Canvas, add_texture, apply_light, light_map, reach_map
 from velfield.synthetic.city.streets import paint_city
-from velfield.synthetic.other_sensor import StaticScene, other_sensor_image
+from velfield.synthetic.other_sensor import other_sensor_image
 from velfield.synthetic.random_streams import RandomStream, random_generator
 from velfield.synthetic.render import MOSAIC_SCALE, SceneMaps
 from velfield.synthetic.traffic.traffic import Traffic, VehicleDimensions, draw_dimensions, simulate_traffic
@@ -85,12 +85,7 @@ class City:
             draw_dimensions(np.zeros(len(parked), bool), rng, self.config.traffic.car_length_m),
             self.traffic.dimensions,
         )
-        dimensions = VehicleDimensions(
-            np.concatenate([moving.length_m, still.length_m]),
-            np.concatenate([moving.width_m, still.width_m]),
-            np.concatenate([moving.height_m, still.height_m]),
-            np.concatenate([moving.shape, still.shape]),
-        )
+        dimensions = VehicleDimensions._make(map(np.concatenate, zip(moving, still, strict=True)))
         return Vehicles(dimensions, draw_tones(driving + len(parked), rng), driving, parked)
 
     @cached_property
@@ -110,6 +105,9 @@ class City:
         camera = self.config.camera
         sigma = MOSAIC_SCALE * float(np.hypot(camera.optics_blur_px, 0.29)) / camera.scale
         mosaic = cv2.GaussianBlur(apply_light(self._tones[0], self.light), (0, 0), sigma)
+        return self._with_heights(mosaic)
+
+    def _with_heights(self, mosaic: GreyImage) -> SceneMaps:
         return SceneMaps(mosaic, *self._heights, np.array([-float(PAD_PX)] * 2), self._step_px)
 
     @cached_property
@@ -119,7 +117,7 @@ class City:
         same = c.base.same_sensor
         rng = self._rng(RandomStream.OTHER_SENSOR)
         return other_sensor_image(
-            StaticScene(self._tones[0 if same else 1], *self._heights, self._step_px, PAD_PX),
+            self._with_heights(self._tones[0 if same else 1]),
             c.base,
             shape=self.base_shape,
             sun=self.sun if same else shadow_vector(c.base.sun_azimuth_deg, c.base.sun_length),

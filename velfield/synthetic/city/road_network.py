@@ -96,17 +96,17 @@ class RoadNetwork:
 
     def out_edges(self) -> list[list[int]]:
         """Edges that leave each node."""
-        out: list[list[int]] = [[] for _ in self.nodes]
-        for number, edge in enumerate(self.edges):
-            out[edge.start].append(number)
-        return out
+        return self._by_node([edge.start for edge in self.edges])
 
     def in_edges(self) -> list[list[int]]:
         """Edges that reach each node."""
-        into: list[list[int]] = [[] for _ in self.nodes]
-        for number, edge in enumerate(self.edges):
-            into[edge.end].append(number)
-        return into
+        return self._by_node([edge.end for edge in self.edges])
+
+    def _by_node(self, node_of_edge: list[int]) -> list[list[int]]:
+        found: list[list[int]] = [[] for _ in self.nodes]
+        for number, node in enumerate(node_of_edge):
+            found[node].append(number)
+        return found
 
 
 class Lane:

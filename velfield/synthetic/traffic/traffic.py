@@ -6,6 +6,7 @@ of position everywhere.
 
 from collections.abc import Sequence, Sized
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,7 @@ STEP_S = 0.1
 MAX_LEGS = 60
 
 
-@dataclass(frozen=True)
-class VehicleDimensions:
+class VehicleDimensions(NamedTuple):
     """Dimensions of vehicles, one row each: ``length_m``, ``width_m``, ``height_m``, ``shape`` (see vehicles.py)."""
 
     length_m: FloatArray
@@ -260,12 +260,9 @@ def _trajectories(
         )
         paths.append(path)
         alongs.append(np.concatenate([[0.0], np.hypot(*np.diff(path, axis=0).T).cumsum()]))
-    kept = VehicleDimensions(
-        dimensions.length_m[seen], dimensions.width_m[seen], dimensions.height_m[seen], dimensions.shape[seen]
-    )
     start_step = log[first[:-1], 0].astype(np.int64) - round(warm_up_s / STEP_S)
     return Traffic(
-        dimensions=kept,
+        dimensions=VehicleDimensions._make(column[seen] for column in dimensions),
         points_m=np.concatenate(paths) if paths else np.empty((0, 2)),
         along_m=np.concatenate(alongs) if alongs else np.empty(0),
         path_first=_offsets(paths),
