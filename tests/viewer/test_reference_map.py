@@ -15,7 +15,7 @@ from rasterio.warp import transform
 
 from velfield.errors import InputError
 from velfield.viewer import reference_map
-from velfield.viewer.reference_map import ReferenceMap, TileServer, open_map, to_coordinates, to_degrees
+from velfield.viewer.reference_map import ReferenceMap, TileServer, change_coordinates, open_map
 
 EAST, NORTH, GSD_M = 391_000.0, 5_819_000.0, 0.25
 SIDE, SQUARE = 600, 100
@@ -264,11 +264,11 @@ def test_another_address_is_refused_in_one_line(given: str, message: str) -> Non
 
 
 def test_coordinates_are_those_of_the_reference_system() -> None:
-    x, y = to_coordinates(13.4, 52.5, UTM)
+    x, y = change_coordinates(13.4, 52.5, 4326, UTM)
     (east,), (north,) = transform("EPSG:4326", f"EPSG:{UTM}", [13.4], [52.5])
     assert (x, y) == (east, north)
-    assert to_degrees(x, y, UTM) == pytest.approx((13.4, 52.5), abs=1e-9)
+    assert change_coordinates(x, y, UTM, 4326) == pytest.approx((13.4, 52.5), abs=1e-9)
     with pytest.raises(InputError, match="found no such reference system"):
-        to_coordinates(13.4, 52.5, 999_999)
+        change_coordinates(13.4, 52.5, 4326, 999_999)
     with pytest.raises(InputError, match="expected a place in the area"):
-        to_degrees(1e12, 5, UTM)
+        change_coordinates(1e12, 5, UTM, 4326)

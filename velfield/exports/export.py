@@ -5,8 +5,11 @@ do not fit into memory has ``write(run, path, options, progress)`` in place of `
 its line in `schemas.export`.
 """
 
+import io
 import tempfile
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -48,6 +51,20 @@ class ExportModule(Protocol):
 
 Progress = Callable[[int, int], None]
 """Called with the steps done and their number."""
+
+
+def zip_bytes(texts: Mapping[str, str]) -> bytes:
+    """Texts by the names of their files as a ZIP archive, the same bytes for the same texts."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in texts.items():
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
+    return out.getvalue()
+
+
+def start_time(run: Run, options: ExportOptions) -> datetime:
+    """When the flight began: by ``--start``, else by what the camera wrote, else 1970."""
+    return options.start or (run.start.time if run.start else datetime(1970, 1, 1, tzinfo=UTC))
 
 
 def export_module(format_name: str) -> ExportModule:

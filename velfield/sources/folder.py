@@ -102,7 +102,6 @@ def iter_folder(path: Path, info: SourceInfo, indices: IntArray) -> Generator[So
 def _read(path: Path, info: SourceInfo, index: int) -> SourceFrame:
     name = info.names[index]
     try:
-        check_size(path / name, *image_size(path / name, max_pixels=info.max_pixels), info.max_pixels)
         grey = read_grey_image(path / name, info.max_pixels, info.levels)
     except InputError as error:
         return unreadable_frame(info, index, int(FrameFlag.UNREADABLE), str(error))

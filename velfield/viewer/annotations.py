@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -179,16 +179,13 @@ def _csv(marks: Marks) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(CSV_COLUMNS)
     for name in marks.frames:
-        writer.writerows(_rows(name, (car for car in marks.cars if car.frame == name)))
+        cars = [car for car in marks.cars if car.frame == name]
+        if not cars:
+            writer.writerow([name, "", "", "", "", ""])
+        for car in cars:
+            lengths = map(_px, (car.length_px, car.width_px))
+            writer.writerow([name, _px(car.x_px), _px(car.y_px), _axial(car.orientation_rad), *lengths])
     return out.getvalue()
-
-
-def _rows(frame: str, cars: Iterable[MarkedCar]) -> list[list[str]]:
-    rows = [
-        [frame, _px(car.x_px), _px(car.y_px), _axial(car.orientation_rad), _px(car.length_px), _px(car.width_px)]
-        for car in cars
-    ]
-    return rows or [[frame, "", "", "", "", ""]]
 
 
 def _axial(orientation_rad: float | None) -> str:

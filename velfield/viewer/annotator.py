@@ -1,7 +1,9 @@
 """The annotation page's server: serves frames and receives marks. It writes one file, the labels."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from starlette.applications import Starlette
 
 from schemas.annotation import Marks
 from schemas.arrays import GreyImage
@@ -9,11 +11,8 @@ from velfield.report.viewer_page import render_editor
 from velfield.viewer.annotations import Frames, read_marks, write_marks
 from velfield.viewer.editing import editing_app
 
-if TYPE_CHECKING:
-    from starlette.applications import Starlette
 
-
-def annotate_app(frames: Frames, labels: Path) -> "Starlette":
+def annotate_app(frames: Frames, labels: Path) -> Starlette:
     """The server that shows ``frames`` and writes ``labels``.
 
     Raises

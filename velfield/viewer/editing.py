@@ -7,18 +7,21 @@ have, and one request at a time.
 import secrets
 import threading
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from pydantic import ValidationError
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import Route
 
 from schemas.arrays import GreyImage, RGBImage
 from velfield.errors import InputError
 from velfield.report.figures import png_bytes
 from velfield.report.viewer_page import page_is_built
-from velfield.viewer.server import headers_for, trusted_host_middleware
-
-if TYPE_CHECKING:
-    from starlette.applications import Starlette
-    from starlette.requests import Request
-    from starlette.routing import Route
+from velfield.viewer.server import TRUSTED_HOSTS, headers_for
 
 _MAX_BYTES = 16 * 2**20
 
@@ -30,7 +33,7 @@ def editing_app(
     *,
     tiles: Callable[[int, int, int], RGBImage | None] | None = None,
     image_origin: str = "",
-) -> "Starlette":
+) -> Starlette:
     """The server of a page that writes.
 
     Parameters
@@ -51,21 +54,16 @@ def editing_app(
     InputError
         The page is not built.
     """
-    from starlette.applications import Starlette
-    from starlette.exceptions import HTTPException
-    from starlette.responses import HTMLResponse, Response
-    from starlette.routing import Route
-
     if not page_is_built():
         raise InputError("the page is not built in this checkout; run `make page` first")
     token = secrets.token_urlsafe(24)
     alone = threading.Lock()
 
-    def show(_: "Request") -> HTMLResponse:
+    def show(_: Request) -> HTMLResponse:
         html = page(token)
         return HTMLResponse(html, headers=headers_for(html, image_origin))
 
-    def image(request: "Request") -> Response:
+    def image(request: Request) -> Response:
         grey = images(request.path_params["number"])
         if grey is None:
             raise HTTPException(404)
@@ -75,15 +73,11 @@ def editing_app(
     if tiles is not None:
         routes.append(_tile_route(tiles))
     routes += [_post_route(path, token, alone, answer) for path, answer in requests.items()]
-    return Starlette(routes=routes, middleware=[trusted_host_middleware()])
+    return Starlette(routes=routes, middleware=[TRUSTED_HOSTS])
 
 
-def _tile_route(tiles: Callable[[int, int, int], RGBImage | None]) -> "Route":
+def _tile_route(tiles: Callable[[int, int, int], RGBImage | None]) -> Route:
     """GET of a map's tiles; Starlette answers them in threads."""
-    from starlette.exceptions import HTTPException
-    from starlette.requests import Request
-    from starlette.responses import Response
-    from starlette.routing import Route
 
     def tile(request: Request) -> Response:
         zoom, column, row = (request.path_params[name] for name in ("zoom", "column", "row"))
@@ -98,14 +92,8 @@ def _tile_route(tiles: Callable[[int, int, int], RGBImage | None]) -> "Route":
     return Route("/map/{zoom:int}/{column:int}/{row:int}.png", tile)
 
 
-def _post_route(path: str, token: str, alone: threading.Lock, answer: Callable[[bytes], dict[str, Any]]) -> "Route":
+def _post_route(path: str, token: str, alone: threading.Lock, answer: Callable[[bytes], dict[str, Any]]) -> Route:
     """POST to ``path``, for who has the token; answered in a thread, as it may take long."""
-    from pydantic import ValidationError
-    from starlette.concurrency import run_in_threadpool
-    from starlette.exceptions import HTTPException
-    from starlette.requests import Request
-    from starlette.responses import JSONResponse
-    from starlette.routing import Route
 
     def answer_alone(body: bytes) -> dict[str, Any]:
         with alone:

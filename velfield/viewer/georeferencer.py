@@ -5,7 +5,9 @@ It changes one run, and only when the page's user saves.
 
 import re
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from starlette.applications import Starlette
 
 from schemas.arrays import GreyImage
 from schemas.georeference import ControlPoint, ControlPointsRecord, MarkedPlace, MarkedPoint, MarkedPoints
@@ -13,10 +15,7 @@ from velfield.errors import InputError
 from velfield.report.viewer_page import render_editor
 from velfield.sources.control_points import WGS84, scale_text
 from velfield.viewer.editing import editing_app
-from velfield.viewer.reference_map import ReferenceMap, TileServer, to_coordinates, to_degrees
-
-if TYPE_CHECKING:
-    from starlette.applications import Starlette
+from velfield.viewer.reference_map import ReferenceMap, TileServer, change_coordinates
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
 _BRACKETS = "()[] \t\r\n"
@@ -34,7 +33,7 @@ def georeference_app(
     save: Save,
     reference: ReferenceMap | TileServer | None = None,
     start: tuple[float, float] | None = None,
-) -> "Starlette":
+) -> Starlette:
     """The server of the page on which a user marks control points.
 
     Parameters
@@ -108,7 +107,7 @@ def find_places(marked: MarkedPoints) -> list[tuple[float, float] | None]:
 def _find_place(marked: MarkedPoints) -> tuple[float, float] | None:
     try:
         ((point,), epsg) = read_marked_points(marked)
-        longitude, latitude = to_degrees(point.x, point.y, epsg)
+        longitude, latitude = change_coordinates(point.x, point.y, epsg, WGS84)
     except InputError:
         return None
     return (longitude, latitude) if abs(longitude) <= 180 and abs(latitude) <= 90 else None
@@ -133,7 +132,7 @@ def write_coordinates(place: MarkedPlace) -> str:
         return f"{place.latitude:.8f}, {place.longitude:.8f}"
     if place.epsg is None:
         raise InputError("found no EPSG code for x, y, expected one such as 32633; fill it in")
-    x, y = to_coordinates(place.longitude, place.latitude, place.epsg)
+    x, y = change_coordinates(place.longitude, place.latitude, WGS84, place.epsg)
     return f"{x:.8f}, {y:.8f}" if abs(x) <= 360 and abs(y) <= 360 else f"{x:.3f}, {y:.3f}"
 
 

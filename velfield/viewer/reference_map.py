@@ -25,6 +25,7 @@ from rasterio.windows import Window
 
 from schemas.arrays import FloatArray, GreyImage
 from velfield.errors import InputError, one_line
+from velfield.sources.control_points import WGS84
 from velfield.sources.frames import local_path
 from velfield.sources.geo import TIFF_DRIVERS, ignore_missing_georeference
 
@@ -294,35 +295,24 @@ def open_map(given: str) -> ReferenceMap | TileServer:
     return TileServer(origin + path, origin)
 
 
-def to_coordinates(longitude: float, latitude: float, epsg: int) -> tuple[float, float]:
-    """A place's coordinates in a reference system, first the one that points to the east.
+def change_coordinates(x: float, y: float, epsg: int, to_epsg: int) -> tuple[float, float]:
+    """A place's coordinates in another reference system; of each first the one that points to the east.
+
+    One of the two codes is `WGS84`'s: longitude and latitude.
 
     Raises
     ------
     InputError
         There is no such system, or it does not cover the place.
     """
-    return _transform_points(_DEGREES, _crs(epsg), longitude, latitude, epsg)
-
-
-def to_degrees(x: float, y: float, epsg: int) -> tuple[float, float]:
-    """Longitude and latitude of coordinates.
-
-    Raises
-    ------
-    InputError
-        There is no such system, or they are outside of its area.
-    """
-    return _transform_points(_crs(epsg), _DEGREES, x, y, epsg)
-
-
-def _transform_points(source: CRS, to: CRS, x: float, y: float, epsg: int) -> tuple[float, float]:
+    source, to = _crs(epsg), _crs(to_epsg)
     try:
         (x_to,), (y_to,) = transform(source, to, [x], [y])
     except CPLE_BaseError:
         x_to = y_to = math.nan
     if not (math.isfinite(x_to) and math.isfinite(y_to)):
-        raise InputError(f"found ({x:.9g}, {y:.9g}), expected a place in the area of EPSG:{epsg}; check the code")
+        other = to_epsg if epsg == WGS84 else epsg
+        raise InputError(f"found ({x:.9g}, {y:.9g}), expected a place in the area of EPSG:{other}; check the code")
     return float(x_to), float(y_to)
 
 

@@ -17,20 +17,27 @@ from html import escape
 from os import environ
 from pathlib import Path
 from sys import platform
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from velfield.errors import InputError
 from velfield.run.flight_record import suggest_run
 from velfield.run.layout import RunLayout
 
-if TYPE_CHECKING:
-    import uvicorn
-    from starlette.applications import Starlette
-
 HOST = "127.0.0.1"
 _STOP_S = 5.0
-_NAMES = [HOST, "localhost"]
+TRUSTED_HOSTS = Middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
+"""Refuses host names other than this machine's."""
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -64,7 +71,7 @@ def headers_for(html: str | None, image_origin: str = "") -> dict[str, str]:
     return {**_HEADERS, "Content-Security-Policy": _NOTHING if html is None else page_policy(html, image_origin)}
 
 
-def view_app(root: Path) -> "Starlette":
+def view_app(root: Path) -> Starlette:
     """The server of a run folder.
 
     Raises
@@ -78,23 +85,17 @@ def view_app(root: Path) -> "Starlette":
 
             open_run(root).require_frames()
         raise InputError(f"{root} holds no index.html: {suggest_run(root)}")
-    from starlette.applications import Starlette
-
-    return Starlette(routes=[_files(root)], middleware=[trusted_host_middleware()])
+    return Starlette(routes=[_files(root)], middleware=[TRUSTED_HOSTS])
 
 
-def runs_app(root: Path) -> "Starlette":
+def runs_app(root: Path) -> Starlette:
     """The server of a folder of run folders: a list of them, and their files."""
-    from starlette.applications import Starlette
-    from starlette.requests import Request
-    from starlette.responses import HTMLResponse
-    from starlette.routing import Route
 
     def index(_request: Request) -> HTMLResponse:
         html = _list_runs(root)
         return HTMLResponse(html, headers=headers_for(html))
 
-    return Starlette(routes=[Route("/", index), _files(root)], middleware=[trusted_host_middleware()])
+    return Starlette(routes=[Route("/", index), _files(root)], middleware=[TRUSTED_HOSTS])
 
 
 _LIST_STYLE = "body{font:1rem sans-serif;margin:2rem}td{padding:.2rem 2rem .2rem 0}"
@@ -121,37 +122,27 @@ def _list_page(root: Path, page: Path) -> str:
     return f'<tr><td><a href="{quote(path)}/">{escape(title)}</a></td><td>{when}</td></tr>'
 
 
-def _files(root: Path) -> Any:
-    """Route to the files of a folder."""
-    from starlette.exceptions import HTTPException
-    from starlette.routing import Mount
-    from starlette.staticfiles import StaticFiles
+class _RunFiles(StaticFiles):
+    """The files of a folder, without hidden ones."""
 
-    class RunFiles(StaticFiles):
-        async def get_response(self, path: str, scope: Any) -> Any:
-            if any(part.startswith(".") and part != "." for part in Path(path).parts):
-                raise HTTPException(404)
-            return await super().get_response(path, scope)
+    async def get_response(self, path: str, scope: Any) -> Any:
+        if any(part.startswith(".") and part != "." for part in Path(path).parts):
+            raise HTTPException(404)
+        return await super().get_response(path, scope)
 
-        def file_response(self, full_path: Any, *arguments: Any, **named: Any) -> Any:
-            response = super().file_response(full_path, *arguments, **named)
-            file = Path(full_path)
-            response.headers.update(headers_for(file.read_text("utf-8") if file.suffix == ".html" else None))
-            return response
-
-    return Mount("/", RunFiles(directory=root, html=True))
+    def file_response(self, full_path: Any, *arguments: Any, **named: Any) -> Any:
+        response = super().file_response(full_path, *arguments, **named)
+        file = Path(full_path)
+        response.headers.update(headers_for(file.read_text("utf-8") if file.suffix == ".html" else None))
+        return response
 
 
-def trusted_host_middleware() -> Any:
-    """Middleware that refuses host names other than this machine's."""
-    from starlette.middleware import Middleware
-    from starlette.middleware.trustedhost import TrustedHostMiddleware
-
-    return Middleware(TrustedHostMiddleware, allowed_hosts=_NAMES, www_redirect=False)
+def _files(root: Path) -> Mount:
+    return Mount("/", _RunFiles(directory=root, html=True))
 
 
 @contextmanager
-def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
+def serve_in_thread(app: Starlette, port: int) -> Iterator[str]:
     """Serve in a thread while the context lasts, on this port, or on any if it is in use; yields the address."""
     try:
         listener = _listen(port)
@@ -169,7 +160,7 @@ def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
 
 
 def serve(
-    app: "Starlette", *, port: int | None, open_browser: bool, announce: Callable[[str], None], start: str = ""
+    app: Starlette, *, port: int | None, open_browser: bool, announce: Callable[[str], None], start: str = ""
 ) -> None:
     """Serve until interrupted.
 
@@ -198,9 +189,7 @@ def serve(
         _server(app).run(sockets=[listener])
 
 
-def _server(app: "Starlette") -> "uvicorn.Server":
-    import uvicorn
-
+def _server(app: Starlette) -> uvicorn.Server:
     return uvicorn.Server(uvicorn.Config(app, log_level="warning", lifespan="off", ws="none", server_header=False))
 
 

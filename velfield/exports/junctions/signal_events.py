@@ -5,10 +5,8 @@ Phase, Parameter and Function. A device is a junction. Greens are those of the c
 and red begins where crossings of the stop line end. A detector lies at the stop line of each lane.
 """
 
-import io
-import zipfile
 from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +17,7 @@ from schemas.export import ExportOptions
 from velfield.analysis.signals.cycles import JunctionSignal, StreamSignal, green_duration_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
+from velfield.exports.export import start_time, zip_bytes
 from velfield.run.run import Run
 
 FILE_NAME = "signal-events.zip"
@@ -26,20 +25,18 @@ GREEN, RED_CLEARANCE, DETECTOR_OFF, DETECTOR_ON = 1, 10, 81, 82
 """Phase begin green, phase begin red clearance, and a detector's ends, in the Indiana Traffic Signal Hi Resolution Data
 Logger Enumerations."""
 FUNCTIONS = ("Presence", "Yellow_Red")
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _LEAST_M_PER_S = 1.0
 
 
 def encode(run: Run, _path: Path, options: ExportOptions) -> bytes:
-    """See `velfield.exports.export.ExportModule`; times count from ``--start``, else from what the camera wrote, else
-    from 1970.
+    """See `velfield.exports.export.ExportModule`; times count from `start_time`.
 
     Raises
     ------
     InputError
         No signal was found.
     """
-    return event_archive(run.analysis.traffic, options.start or (run.start.time if run.start else _EPOCH))
+    return event_archive(run.analysis.traffic, start_time(run, options))
 
 
 def event_archive(analysis: TrafficAnalysis, start: datetime) -> bytes:
@@ -62,12 +59,8 @@ def event_archive(analysis: TrafficAnalysis, start: datetime) -> bytes:
         ],
         columns=["DeviceId", "Phase", "Parameter", "Function"],
     )
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, table in (("events.csv", events), ("detectors.csv", detectors)):
-            text = table.to_csv(index=False, lineterminator="\n")
-            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
-    return out.getvalue()
+    tables = {"events.csv": events, "detectors.csv": detectors}
+    return zip_bytes({name: table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()})
 
 
 def _streams(signal: JunctionSignal) -> Iterator[tuple[int, StreamSignal]]:

@@ -18,7 +18,7 @@ from velfield.run.run import Run
 
 FILE_NAME = "turning_counts.xlsx"
 BIN_S = 900.0
-_TURNS = {"left": "L", "straight": "T", "right": "R", "u-turn": "U"}
+TURN_LETTERS = {"left": "L", "straight": "T", "right": "R", "u-turn": "U"}
 _BOUND = {"N": "SB", "NE": "SWB", "E": "WB", "SE": "NWB", "S": "NB", "SW": "NEB", "W": "EB", "NW": "SEB"}
 
 
@@ -71,10 +71,10 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
     """
     begin, end = analysis.window_s
     bins = max(int(np.ceil((end - begin) / BIN_S)), 1)
-    moves = sorted(found.movements, key=lambda m: (m.arm_in, list(_TURNS).index(m.turn), m.arm_out))
+    moves = sorted(found.movements, key=lambda m: (m.arm_in, list(TURN_LETTERS).index(m.turn), m.arm_out))
     counts = np.array([_entries(found, m.arm_in, m.arm_out, begin, bins) for m in moves])
     kind = analysis.junction_kind(found.junction.number)
-    head = [f"{bound(m.arm_in)} {_TURNS[m.turn]}" for m in moves]
+    head = [f"{bound(m.arm_in)} {TURN_LETTERS[m.turn]}" for m in moves]
     rows: list[list[Any]] = [
         [f"Junction {found.junction.number} ({kind}); arms by where they lead to, {analysis.arm_names.legend}"],
         ["From arm, to arm", *(f"{m.arm_in} to {m.arm_out}" for m in moves)],

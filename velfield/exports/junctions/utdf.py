@@ -17,6 +17,7 @@ from velfield.analysis.movements.movements import JunctionMovements, Movement
 from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
+from velfield.exports.junctions.turning_counts import TURN_LETTERS
 from velfield.run.run import Run
 
 FILE_NAME = "synchro.csv"
@@ -24,7 +25,6 @@ BOUNDS = ("NB", "NE", "EB", "SE", "SB", "SW", "WB", "NW")
 """Directions of travel of approaches, clockwise."""
 _SIDES = ("S", "SW", "W", "NW", "N", "NE", "E", "SE")
 """Sides of the image from which these come."""
-_TURNS = {"left": "L", "straight": "T", "right": "R", "u-turn": "U"}
 _SHARES_LANE = 0.1
 """A lane is of the turns that at least this fraction of its vehicles take."""
 _SIGNAL, _EXTERNAL, _NO_SIGNAL, _ROUNDABOUT = 0, 1, 3, 4
@@ -98,7 +98,7 @@ class _Node:
         self.far = {arm.name: 100 * self.number + arm.number + 1 for arm in found.gates.arms}
         self.groups: defaultdict[str, list[Movement]] = defaultdict(list)
         for m in sorted(found.movements, key=lambda m: -(m.seen + m.inferred)):
-            self.groups[self.bounds[m.arm_in] + _TURNS[m.turn]].append(m)
+            self.groups[self.bounds[m.arm_in] + TURN_LETTERS[m.turn]].append(m)
         signal = analysis.signals.get(found.junction.number)
         self.signal: JunctionSignal | None = signal if signal and signal.signalised else None
 
@@ -188,7 +188,7 @@ class _Node:
         the group straight on, if there is one."""
         passes, gates = self.found.passes, self.found.gates.gates
         arm = np.array([gate.arm for gate in gates] + [-1])
-        turn = {(m.arm_in, m.arm_out): _TURNS[m.turn] for m in self.found.movements}
+        turn = {(m.arm_in, m.arm_out): TURN_LETTERS[m.turn] for m in self.found.movements}
         name = [a.name for a in self.found.gates.arms]
         lanes: defaultdict[str, int] = defaultdict(int)
         shared: defaultdict[str, int] = defaultdict(int)

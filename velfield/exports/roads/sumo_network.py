@@ -7,8 +7,6 @@ Each lane is an edge with one lane, of the shape that vehicles drove. SUMO's sam
     routeSampler.py -r velfield.rou.xml --edgedata-files velfield.edgedata.xml --turn-files velfield.turns.xml
 """
 
-import io
-import zipfile
 from collections import Counter, defaultdict
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +16,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray
 from schemas.export import ExportOptions
+from velfield.exports.export import zip_bytes
 from velfield.exports.junctions.turning_counts import BIN_S
 from velfield.exports.roads.network import RoadNetwork, road_network
 from velfield.run.run import Run
@@ -56,21 +55,18 @@ def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
 
 def sumo_archive(network: RoadNetwork) -> bytes:
     """All files of a network as a ZIP archive."""
-    files = {
-        "velfield.nod.xml": _nodes_xml(network),
-        "velfield.edg.xml": _edges_xml(network),
-        "velfield.con.xml": _connections_xml(network),
-        "velfield.rou.xml": _routes_xml(network),
-        "velfield.edgedata.xml": _edge_data_xml(network),
-        "velfield.turns.xml": _turns_xml(network),
-        "velfield.netccfg": _NETCONVERT,
-        "velfield.sumocfg": _SUMO.format(head=_HEAD, end=network.duration_s + _END_LATER_S),
-    }
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, text in files.items():
-            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
-    return out.getvalue()
+    return zip_bytes(
+        {
+            "velfield.nod.xml": _nodes_xml(network),
+            "velfield.edg.xml": _edges_xml(network),
+            "velfield.con.xml": _connections_xml(network),
+            "velfield.rou.xml": _routes_xml(network),
+            "velfield.edgedata.xml": _edge_data_xml(network),
+            "velfield.turns.xml": _turns_xml(network),
+            "velfield.netccfg": _NETCONVERT,
+            "velfield.sumocfg": _SUMO.format(head=_HEAD, end=network.duration_s + _END_LATER_S),
+        }
+    )
 
 
 def lane_nodes(network: RoadNetwork) -> dict[tuple[int, str], int]:

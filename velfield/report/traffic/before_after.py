@@ -10,7 +10,7 @@ from velfield.analysis.intervals import Estimate
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.drawing import figure_bytes, new_figure
-from velfield.report.traffic.report import DPI, STYLE
+from velfield.report.traffic.report import DPI, page_html
 from velfield.report.traffic.turning import draw_turning
 
 _UNITS = {"m/s": (3.6, "km/h"), "": (100.0, "%")}
@@ -51,14 +51,13 @@ def before_after_html(
     )
     heads = "".join(f"<th>{head}</th>" for head in ("Quantity", "Before", "After", "p", "More than chance"))
     seen = [seen_text(analysis.trajectories) for analysis in (before, after)]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Before and after</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head><body>'
-        f'<h1>Before and after</h1><p class="seen">Before: {seen[0]}. After: {seen[1]}.</p>'
+    return page_html(
+        "Before and after",
+        f"Before: {seen[0]}. After: {seen[1]}.",
         f"<h2>What changed</h2><p>{len(real)} of {len(changes)} comparisons of junctions and roads.</p>{verdict}"
         "<p class='note'>In brackets: the 90 % interval, and n. Of the changes that are listed some "
         f"{FDR_LEVEL:.0%} are chance (false discovery rate).</p>{pictures}{figures}"
-        f"<h2>All that was compared</h2><div class='scroll'><table><tr>{heads}</tr>{rows}</table></div></body></html>"
+        f"<h2>All that was compared</h2><div class='scroll'><table><tr>{heads}</tr>{rows}</table></div>",
     )
 
 

@@ -24,7 +24,7 @@ _TOP_IN, _FOOT_IN = 11.0, 0.4
 _WRAP, _LINE_IN = 118, 0.16
 """Characters and height of a line of the answers."""
 BRACKETS = "Numbers in brackets: the 90 % interval, and n, the number of vehicles, cycles or events that it rests on."
-STYLE = """
+_STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 1.5em auto; max-width: 58em; padding: 0 1em; color: #1b1f24 }
 h1 { line-height: 1.2; margin-bottom: 0.2em } h2 { margin: 1.6em 0 0.3em }
 .seen { font-size: 1.1em; color: #4b545d; margin: 0 0 1em }
@@ -59,12 +59,21 @@ def report_html(
     missing = f'<div class="withheld"><h2>What is not known</h2><ul>{withheld}</ul></div>' if withheld else ""
     pictures = [_picture(diagram) for diagram in diagrams]
     tables = "".join(_table(table) + _clips(table, clips or {}) for table in record.tables)
+    return page_html(
+        "Traffic analysis",
+        escape(_seen(record, page)),
+        f"{''.join(pictures[:1])}<h2>Answers</h2><dl>{answers}</dl><p class='note'>{BRACKETS}</p>{missing}"
+        f"{''.join(pictures[1:])}<h2>Tables</h2><p class='note'>All rows are in analysis.xlsx and analysis.json.</p>"
+        f"{tables}",
+    )
+
+
+def page_html(title: str, seen: str, body: str) -> str:
+    """A page that holds all it shows: its title, what was seen, and the rest."""
     return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Traffic analysis</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head><body>'
-        f'<h1>Traffic analysis</h1><p class="seen">{escape(_seen(record, page))}</p>{"".join(pictures[:1])}'
-        f"<h2>Answers</h2><dl>{answers}</dl><p class='note'>{BRACKETS}</p>{missing}{''.join(pictures[1:])}"
-        f"<h2>Tables</h2><p class='note'>All rows are in analysis.xlsx and analysis.json.</p>{tables}</body></html>"
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head><body>'
+        f'<h1>{title}</h1><p class="seen">{seen}</p>{body}</body></html>'
     )
 
 
