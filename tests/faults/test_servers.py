@@ -16,7 +16,6 @@ import numpy as np
 import psutil
 import pytest
 
-from flows.runners import RunnerConfig, open_runner
 from schemas.summary import RunSummary
 from tests.small_flight import job, process
 from tests.viewer.test_viewer_server import served
@@ -91,16 +90,6 @@ def test_each_page_as_a_process_listens_on_this_machine_alone(
     shutil.copytree(whole[0], tmp_path / "run")
     with velfield_process(command, str(tmp_path / "run"), "--no-open") as process:
         assert sockets_seen(process, until=lambda: True) == {"127.0.0.1"}
-
-
-def test_a_local_cluster_listens_on_this_machine_alone() -> None:
-    """Scheduler, workers, their nannies and the dashboard."""
-    before = listening(psutil.Process())
-    with open_runner(RunnerConfig(workers=1)):
-        own = psutil.Process()
-        opened = listening(own, *own.children(recursive=True)) - before
-    assert len(opened) >= 3
-    assert {ip for _, ip, _ in opened} == {"127.0.0.1"}
 
 
 @pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")

@@ -75,16 +75,30 @@ def stages_not_loaded() -> list[str]:
     return sorted(modules - set(sys.modules))
 
 
-def test_workers_of_our_own_keep_memory_for_pictures_import_the_stages_first_and_are_restarted() -> None:
-    """With Dask's own setting of memory a run takes half as long again."""
+def note_slowly(path: Path) -> None:
+    time.sleep(0.5)
+    with path.open("a") as file:
+        file.write("computed\n")
+
+
+def test_workers_of_our_own_keep_memory_for_pictures_import_the_stages_first_and_are_restarted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With Dask's own setting of memory a run takes half as long again; and Dask computes what a client still holds
+    again, where the worker that has its result ends."""
+    monkeypatch.setattr("flows.runners._WAIT_S", 0.1)
     prepare_process(verbose=False)
     with open_runner(RunnerConfig(workers=1)) as runner:
         assert runner.compute(delayed(stages_not_loaded)()) == []  # before the first task
         assert runner.call(os.environ.get, "MALLOC_TRIM_THRESHOLD_") == str(256 << 20)
         before = runner.call(os.getpid)
         assert runner.call(os.getpid) == before
+        note = runner.compute(delayed(note_slowly)(tmp_path / "notes"))
+        assert note is None
         runner.restart_workers()
         assert runner.call(os.getpid) not in (before, os.getpid())
+        runner.call(time.sleep, 1.5)
+    assert (tmp_path / "notes").read_text() == "computed\n"
 
 
 def test_workers_of_others_are_not_restarted() -> None:
@@ -115,25 +129,6 @@ def test_workers_that_the_cluster_gave_up_are_replaced(
             with pytest.raises(WorkersKilledError):
                 runner.call(os.kill, before, 9)
         assert runner.call(os.getpid) not in (before, os.getpid())
-
-
-def note_slowly(path: Path) -> None:
-    time.sleep(0.5)
-    with path.open("a") as file:
-        file.write("computed\n")
-
-
-def test_what_was_computed_is_not_again_where_workers_are_restarted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Dask computes what a client still holds again, where the worker that has its result ends."""
-    monkeypatch.setattr("flows.runners._WAIT_S", 0.1)
-    with open_runner(RunnerConfig(workers=1)) as runner:
-        note = runner.compute(delayed(note_slowly)(tmp_path / "notes"))
-        assert note is None
-        runner.restart_workers()
-        runner.call(time.sleep, 1.5)
-    assert (tmp_path / "notes").read_text() == "computed\n"
 
 
 def before_detection(whole: Path, root: Path) -> Path:

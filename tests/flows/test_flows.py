@@ -120,22 +120,6 @@ def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], f
     assert speeds.max() < 14  # a position may be refined by a pixel or two after the gates
 
 
-def test_a_ground_sample_distance_given_later_keeps_what_does_not_depend_on_it(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
-    root = tmp_path / "copy"
-    shutil.copytree(whole[0], root)
-    given = job(flight, root)
-    changed = process(given.model_copy(update={"config": given.config.model_copy(update={"gsd_m": 0.25})}))
-    assert redone(changed) == following_names("georeference")
-    assert open_run(root).grid.gsd_m == 0.25
-
-
-def following_names(first: str) -> list[str]:
-    names = list(STAGE)
-    return names[names.index(first) :]
-
-
 def test_workers_give_the_same_bits(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,22 +255,26 @@ def test_commit_records_hold_counts_and_digests(whole: tuple[Path, RunSummary]) 
     assert all(digest for name, digest in record["outputs"].items() if name.endswith(".parquet"))
 
 
-def test_detections_of_another_detector_take_the_place_of_ours(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def true_boxes(flight: Path) -> pd.DataFrame:
+    """Places of the visible cars within the frames, raw px, as another detector gives them."""
     from velfield.synthetic.truth import load_truth
 
     cars = load_truth(flight).cars
-    cars = cars[cars["visible"]]
     names = sorted(path.name for path in (flight / "frames").iterdir())
-    table = pd.DataFrame(
+    cars = cars[cars["visible"] & cars["x_raw_px"].between(0, 639) & cars["y_raw_px"].between(0, 479)]
+    return pd.DataFrame(
         {"frame": [names[k] for k in cars["frame"]], "x_px": cars["x_raw_px"], "y_px": cars["y_raw_px"]}
     )
-    inside = table["x_px"].between(0, 639) & table["y_px"].between(0, 479)
-    table[inside].to_csv(tmp_path / "boxes.csv", index=False)
+
+
+def test_detections_of_another_detector_take_the_place_of_ours(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    table = true_boxes(flight)
+    table.to_csv(tmp_path / "boxes.csv", index=False)
     summary = process(job(flight, tmp_path / "run", detections=str(tmp_path / "boxes.csv")))
     counts = {stage.name: stage.counts for stage in summary.stages}
-    assert counts["detections"]["cars"] == pytest.approx(inside.sum(), rel=0.02)
+    assert counts["detections"]["cars"] == pytest.approx(len(table), rel=0.02)
     assert counts["tracks"]["tracks"] > 20
     assert "external detections" in next(stage.text for stage in summary.stages if stage.name == "detector")
 
@@ -307,14 +295,7 @@ def test_boxes_of_few_frames_unused_inputs_and_empty_maps_are_warned_of(flight: 
 
 def test_the_size_of_given_boxes_sets_the_working_scale(flight: Path, tmp_path: Path) -> None:
     """Where no ground sample distance is given; boxes without a size are warned of."""
-    from velfield.synthetic.truth import load_truth
-
-    cars = load_truth(flight).cars
-    names = sorted(path.name for path in (flight / "frames").iterdir())
-    cars = cars[cars["visible"] & cars["x_raw_px"].between(0, 639) & cars["y_raw_px"].between(0, 479)]
-    table = pd.DataFrame(
-        {"frame": [names[k] for k in cars["frame"]], "x_px": cars["x_raw_px"], "y_px": cars["y_raw_px"]}
-    )
+    table = true_boxes(flight)
     sized, bare = tmp_path / "sized.csv", tmp_path / "bare.csv"
     table.to_csv(bare, index=False)
     table.assign(length_px=20.0, width_px=9.0).to_csv(sized, index=False)

@@ -344,14 +344,6 @@ def test_a_video_larger_than_the_limit_is_refused(tmp_path, frames):
 
 
 @pytest.mark.parametrize(
-    "address", ["http://example.org/a.mp4", "https://example.org/a", "concat:a.ts|b.ts", "s3://b/a", "file:///a"]
-)
-def test_addresses_and_protocols_are_refused(address):
-    assert_stops(address, "is not supported")
-    assert_stops(Path(address), "is not supported")
-
-
-@pytest.mark.parametrize(
     "content",
     [
         b"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nsecret.ts\n#EXT-X-ENDLIST\n",

@@ -2,8 +2,10 @@
 
 import json
 import math
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -24,6 +26,7 @@ ANGLES = {
 }
 LENGTH, WIDTH = 18.0, 8.0
 Car = tuple[float, float, float]
+Writer = Callable[[str, list[Car]], str]
 
 
 def cars(angles: str) -> list[Car]:
@@ -236,6 +239,71 @@ def test_every_dialect_has_the_axes_that_were_drawn(tmp_path: Path, name: str, a
     assert any("cars" in note for note in labels.notes) or name in ("own_csv.csv", "geojson.json")
 
 
+RECT = {"x": 140.5, "y": 16.5, "width": 20, "height": 8}
+
+
+def add_geojson(content: Any) -> None:
+    point = {"type": "Point", "coordinates": [150.0, 20.0]}
+    for frame, geometry in (("a.png", point), ("b.png", None)):
+        content["features"].append({"type": "Feature", "properties": {"frame": frame}, "geometry": geometry})
+
+
+def add_coco(content: Any) -> None:
+    content["images"].append({"id": 8, "file_name": "b.jpg"})
+    content["annotations"] += [
+        {"image_id": 1, "category_id": 3, "bbox": list(RECT.values())},
+        {"image_id": 1, "category_id": 7, "bbox": [10, 10, 40, 10]},
+    ]
+
+
+def add_labelme(content: Any) -> None:
+    content["imagePath"] = "..\\images\\a.png"
+    content["shapes"] += [
+        {"label": "car", "points": [[140.5, 16.5], [160.5, 24.5]], "shape_type": "rectangle"},
+        {"label": "tree", "points": [[5, 5]], "shape_type": "point"},
+    ]
+
+
+def add_via(content: Any) -> None:
+    content["a.png"]["regions"] += [
+        {"shape_attributes": {"name": "rect", **RECT}, "region_attributes": {"type": {"car": True}}},
+        {"shape_attributes": {"name": "point", "cx": 5, "cy": 5}, "region_attributes": {"type": "lorry"}},
+    ]
+    content["_via_img_metadata"] = {**content}
+
+
+MIXED = (
+    (geojson, add_geojson, 0, 2),
+    (coco_polygon, add_coco, 1, 2),
+    (labelme, add_labelme, 1, 1),
+    (via, add_via, 1, 1),
+)
+
+
+@pytest.mark.parametrize(("write", "add", "others", "frames"), MIXED)
+def test_shapes_of_several_kinds_and_images_without_any_are_read(
+    tmp_path: Path, write: Writer, add: Callable[[Any], None], others: int, frames: int
+) -> None:
+    content = json.loads(write("a.png", cars("turned")[:1]))
+    add(content)
+    (tmp_path / "l.json").write_text(json.dumps(content))
+    labels = read_labels(tmp_path / "l.json", FOLDER)
+    assert labels.cars[["x_px", "y_px"]].to_numpy() == pytest.approx(np.array([CENTRES[0], (150, 20)]), abs=0.01)
+    assert len(labels.ignored) == others
+    assert labels.frames == ("a.png", "b.png")[:frames]
+
+
+def test_a_folder_of_labelme_files_and_a_csv_of_via(tmp_path: Path) -> None:
+    (tmp_path / "me").mkdir()
+    for name in ("a.png", "b.png"):
+        (tmp_path / "me" / f"{name[0]}.json").write_text(labelme(name, cars("turned")))
+    assert read_labels(tmp_path / "me", FOLDER).frames == ("a.png", "b.png")
+    shape = json.dumps({"name": "rect", **RECT}).replace('"', '""')
+    csv = f'filename,region_shape_attributes,region_attributes\nb.png,"{shape}","{{}}"\n'
+    (tmp_path / "via.csv").write_text(csv)
+    assert read_labels(tmp_path / "via.csv", FOLDER).cars["x_px"].tolist() == [150.0]
+
+
 UPRIGHT = ("cvat_coco.json", "coco_polygon.json", "cvat_images.xml", "label_studio.json", "datumaro.json", "a.txt")
 
 
@@ -269,13 +337,13 @@ NAMES_IN_VIDEO = {
 
 
 @pytest.mark.parametrize(("image", "write"), list(product(NAMES_IN_FOLDER, (cvat_coco, labelme))))
-def test_renamed_images_of_a_folder_are_found(tmp_path: Path, image: str, write: object) -> None:
+def test_renamed_images_of_a_folder_are_found(tmp_path: Path, image: str, write: Writer) -> None:
     (tmp_path / "l.json").write_text(write(image, cars("turned")))
     assert_are(read_labels(tmp_path / "l.json", FOLDER), cars("turned"))
 
 
 @pytest.mark.parametrize(("image", "write"), list(product(NAMES_IN_VIDEO, (cvat_coco, via, yolo_obb))))
-def test_the_frame_of_a_video_is_the_right_one_or_asked_for(tmp_path: Path, image: str, write: object) -> None:
+def test_the_frame_of_a_video_is_the_right_one_or_asked_for(tmp_path: Path, image: str, write: Writer) -> None:
     path = tmp_path / (f"{image.rsplit('.', 1)[0]}.txt" if write is yolo_obb else "l.json")
     path.write_text(write(image, cars("turned")))
     frame = NAMES_IN_VIDEO[image]
@@ -343,6 +411,10 @@ def test_classes_are_known_by_the_names_of_every_layout(tmp_path: Path, layout: 
     assert f"classes by {Path(file).name}: cars are car (2); ignored: bus (1)" in labels.notes
 
 
+def of_labelme(shapes: list[dict[str, object]]) -> str:
+    return json.dumps({"imagePath": "a.png", "shapes": shapes})
+
+
 QUESTIONS = {
     "several numbers without names": ("a.txt", "0 0.5 0.5 0.1 0.1\n1 0.2 0.5 0.1 0.1\n", "without names, expected"),
     "a number beyond the names": ("a.txt", "5 0.5 0.5 0.1 0.1\n", "class 5 in labels, but no name"),
@@ -378,6 +450,15 @@ QUESTIONS = {
         coco("a.png", [{"image_id": 1, "category_id": 3, "bbox": [5, 5, float("inf"), 9]}]),
         "no finite number",
     ),
+    "no JSON": ("l.json", "{", "no JSON"),
+    "a list of numbers": ("l.json", "[1, 2]", "JSON of another kind, expected labels of GeoJSON, COCO"),
+    "an object of another kind": ("l.json", '{"a": 1}', "JSON of another kind"),
+    "an image that is not there": ("l.json", coco("a.png", [{"image_id": 99, "bbox": [1, 1, 2, 2]}]), "with KeyError"),
+    "points that are none": ("l.json", of_labelme([{"points": "x"}]), "LabelMe labels with ValueError"),
+    "an image of another source": ("l.json", labelme("elsewhere.png", cars("turned")), "no frame of this source has"),
+    "no car": ("l.json", of_labelme([{"label": "tree", "points": [[5, 5]]}]), "expected one of cars"),
+    "a car outside": ("l.json", of_labelme([{"label": "car", "points": [[900, 5]]}]), "outside the image"),
+    "no image": ("l.json", json.dumps({"type": "FeatureCollection", "features": []}), "labels of the images none"),
     "a document type": ("l.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><annotations/>", "document type"),
 }
 
