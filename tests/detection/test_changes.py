@@ -15,7 +15,7 @@ from velfield.detection.crops import oriented_strips
 from velfield.detection.detect import SearchedFrame, changed_cells, search_frame
 from velfield.detection.frame import ComparableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
-from velfield.detection.mosaic import CROP_UNIT_PX, Box, Mosaic, assemble, find_in_boxes, find_owners, pack_boxes
+from velfield.detection.mosaic import CROP_UNIT_PX, Mosaic, assemble, find_in_boxes, find_owners, pack_boxes
 from velfield.detection.registry import shipped_detector
 
 _SHAPE = 300, 420
@@ -50,12 +50,10 @@ def near(found: Points, x: float, y: float) -> bool:
     return bool(len(found)) and bool((np.hypot(found[:, 0] - x, found[:, 1] - y) < 4).any())
 
 
-def boxes_of_px(*boxes: Box) -> list[Box]:
-    """Boxes of cells that cover boxes of px."""
-    return [
-        (top // CELL_PX, left // CELL_PX, -(-bottom // CELL_PX), -(-right // CELL_PX))
-        for top, left, bottom, right in boxes
-    ]
+def boxes_of_px(*boxes: tuple[int, int, int, int]) -> np.ndarray:
+    """Boxes of cells (n, 4) that cover boxes of px."""
+    px = np.array(boxes)
+    return np.column_stack([px[:, :2] // CELL_PX, -(-px[:, 2:] // CELL_PX)])
 
 
 def test_noise_and_exposure_are_no_change_and_a_car_that_moved_is() -> None:
@@ -118,14 +116,14 @@ def test_what_is_found_in_a_mosaic_of_boxes_is_what_is_found_in_each_box() -> No
         taken[row : row + height, column : column + width] += 1
     assert taken.max() == 1, "crops do not overlap"
     together = find_in_boxes(detector, searched, boxes, -0.2)
-    alone = [find_in_boxes(detector, searched, [box], -0.2) for box in boxes]
+    alone = [find_in_boxes(detector, searched, box[None], -0.2) for box in boxes]
     assert [len(one) for one in alone] == [1, 1, 1, 1, 1]
     np.testing.assert_allclose(together.to_rows(), concatenate(alone).to_rows(), rtol=0, atol=1e-4)
 
 
 def test_crops_of_many_boxes_overlap_nowhere_and_fill_half_of_their_mosaics() -> None:
     rng = np.random.default_rng(9)
-    boxes: list[Box] = [(0, 0, int(rows), int(columns)) for rows, columns in rng.integers(1, 60, (80, 2))]
+    boxes = np.concatenate([np.zeros((80, 2), np.int64), rng.integers(1, 60, (80, 2))], axis=1)
     found = pack_boxes(boxes, 16)
     assert len(found) > 2
     assert sorted(number for one in found for number in one.numbers) == list(range(80))
@@ -140,7 +138,7 @@ def test_crops_of_many_boxes_overlap_nowhere_and_fill_half_of_their_mosaics() ->
             taken[top : top + height, left : left + width] += 1
         assert taken.max() == 1
         assert taken.mean() > 0.5
-    assert pack_boxes([], 16) == []
+    assert pack_boxes(boxes[:0], 16) == []
     assert CROP_UNIT_PX == ALIGNMENT, "what the network needs"
 
 
@@ -156,7 +154,7 @@ def test_windows_that_reach_beyond_the_image_go_on(border: int, mode: str) -> No
         inside = image[max(0, top) : top + rows, max(0, left) : left + columns]
         beyond = (max(0, -top), max(0, top + rows - 50)), (max(0, -left), max(0, left + columns - 60))
         expected[y : y + rows, x : x + columns] = np.pad(inside, beyond, mode=mode)
-    found = assemble(image, corners, Mosaic((160, 112), np.arange(6), crops), border)
+    found = assemble(image, Mosaic((160, 112), np.arange(6), crops, corners), border)
     np.testing.assert_array_equal(found, expected)
 
 
@@ -215,7 +213,7 @@ def test_boxes_cover_the_marked_cells_once_and_cost_no_more_than_one_box(share: 
 def test_two_marks_far_apart_are_two_boxes() -> None:
     cells = np.zeros((20, 30), bool)
     cells[2, 3] = cells[17, 25] = True
-    assert sorted(split_into_boxes(cells, 1.0, 16.0)) == [(2, 3, 3, 4), (17, 25, 18, 26)]
+    assert sorted(split_into_boxes(cells, 1.0, 16.0).tolist()) == [[2, 3, 3, 4], [17, 25, 18, 26]]
 
 
 def test_detections_stay_where_nothing_changed_and_follow_what_moved() -> None:

@@ -6,10 +6,9 @@ import numpy as np
 
 from schemas.arrays import IntArray, Mask
 from velfield.compiled import kernel
-from velfield.detection.mosaic import Box
 
 
-def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
+def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> IntArray:
     """Disjoint boxes that cover the marked cells, cheap to search.
 
     Boxes are split in two, by the row or the column after which both are smallest, down to single cells; then, from
@@ -22,9 +21,12 @@ def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
         (rows, columns).
     margin, box_cost
         In cells, and in areas of a cell.
+
+    Returns
+    -------
+    (n, 4) first row, first column, row and column after the last.
     """
-    found = _split_kernel(np.ascontiguousarray(cells), margin, box_cost)
-    return [(int(top), int(left), int(bottom), int(right)) for top, left, bottom, right in found]
+    return np.asarray(_split_kernel(np.ascontiguousarray(cells), margin, box_cost))
 
 
 @kernel

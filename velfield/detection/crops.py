@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray
+from velfield.compiled import kernel
 
 CHIP_PX = 32
 """Side of the upright chips, the widest crops."""
@@ -28,12 +29,25 @@ def oriented_patches(
     count = len(xy)
     if not count:
         return np.empty((0, length, width), np.uint8)
-    along, across = (np.arange(size) - (size - 1) / 2 for size in (length, width))
-    cosine, sine = np.cos(orientation_rad)[:, None], np.sin(orientation_rad)[:, None]
-    x, y = np.empty((2, count, length, width), np.float32)
-    np.subtract((xy[:, :1] + along * cosine)[:, :, None], (across * sine)[:, None], out=x)
-    np.add((xy[:, 1:] + along * sine)[:, :, None], (across * cosine)[:, None], out=y)
-    return _sample(image, x.reshape(count, -1), y.reshape(count, -1)).reshape(count, length, width)
+    x, y = _grid_kernel(xy, np.cos(orientation_rad), np.sin(orientation_rad), length, width)
+    return _sample(image, x, y).reshape(count, length, width)
+
+
+@kernel
+def _grid_kernel(
+    xy: FloatArray, cosine: FloatArray, sine: FloatArray, length: int, width: int
+) -> tuple[Float32Array, Float32Array]:
+    """Where the pixels of patches lie in an image, row by row: x and y, each (n, length width) float32."""
+    x, y = np.empty((len(xy), length * width), np.float32), np.empty((len(xy), length * width), np.float32)
+    for n in range(len(xy)):
+        for i in range(length):
+            along = i - (length - 1) / 2
+            begin_x, begin_y = xy[n, 0] + along * cosine[n], xy[n, 1] + along * sine[n]
+            for j in range(width):
+                across = j - (width - 1) / 2
+                x[n, i * width + j] = begin_x - across * sine[n]
+                y[n, i * width + j] = begin_y + across * cosine[n]
+    return x, y
 
 
 def upright_chips(image: GreyImage, xy: FloatArray) -> GreyImage:
@@ -43,9 +57,27 @@ def upright_chips(image: GreyImage, xy: FloatArray) -> GreyImage:
 
 def crops_at(image: GreyImage, corners: IntArray, side_px: int) -> GreyImage:
     """Crops (n, side, side) uint8 whose first pixels are at (n, 2): x, y; beyond the image its edge goes on."""
-    padded = cv2.copyMakeBorder(image, *(side_px,) * 4, cv2.BORDER_REPLICATE)
-    x, y = (np.clip(corners[:, k], -side_px, image.shape[1 - k]) + side_px for k in (0, 1))
-    return np.lib.stride_tricks.sliding_window_view(padded, (side_px, side_px))[y, x]
+    return np.asarray(_chips_kernel(image, corners, side_px))
+
+
+@kernel
+def _chips_kernel(image: ByteArray, corners: IntArray, side: int) -> ByteArray:
+    """Crops with these corners (n, 2); beyond the image its edge goes on."""
+    height, width = image.shape
+    out = np.empty((len(corners), side, side), np.uint8)
+    for n in range(len(corners)):
+        left, top = corners[n]
+        if 0 <= left <= width - side and 0 <= top <= height - side:
+            for i in range(side):
+                source, target = image[top + i], out[n, i]
+                for j in range(np.uint64(side)):
+                    target[j] = source[np.uint64(left) + j]
+            continue
+        for i in range(side):
+            y = min(max(corners[n, 1] + i, 0), height - 1)
+            for j in range(side):
+                out[n, i, j] = image[y, min(max(corners[n, 0] + j, 0), width - 1)]
+    return out
 
 
 def oriented_strips(half_image: GreyImage, xy: FloatArray, orientation_rad: FloatArray) -> GreyImage:

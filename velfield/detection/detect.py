@@ -181,7 +181,7 @@ def search_frame(
         cells = changed | (covered & _cells_to_repeat(changed, reference.detections, length_px))
     boxes = split_into_boxes(cells, detector.context_px / CELL_PX, detector.box_cost_px / CELL_PX**2)
     searched = np.zeros(cells.shape, bool)
-    for top, left, bottom, right in boxes:
+    for top, left, bottom, right in boxes.tolist():
         searched[top:bottom, left:right] = True
     frame.resample(_grow(searched, -(-(detector.context_px + CROP_UNIT_PX - CELL_PX) // CELL_PX)), CELL_PX)
     found = find_in_boxes(detector, frame, boxes, weak_above)

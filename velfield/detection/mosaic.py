@@ -5,7 +5,6 @@ calls. So crops lie on shelves as tall as their tallest one, and are searched to
 the network), or else one after another (`Detector.find_in_crops`); candidates in the context are dropped.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,8 +15,6 @@ from velfield.detection.changes import CELL_PX
 from velfield.detection.frame import SearchableFrame
 from velfield.detection.interface import Detections, Detector, concatenate
 
-Box = tuple[int, int, int, int]
-"""Rectangle of cells: first row, first column, row and column after the last."""
 _SIDE_PX = 1024
 """Side of a mosaic, unless a crop is larger."""
 CROP_UNIT_PX = 16
@@ -33,33 +30,31 @@ class Mosaic:
     shape : (height, width), px.
     numbers : (n,) of the boxes, in the order of the crops.
     crops : (n, 4) where they lie: first row, first column, height and width.
+    corners : (n, 2) first row and column of what they show of the frame.
     """
 
     shape: tuple[int, int]
     numbers: IntArray
     crops: IntArray
+    corners: IntArray
 
 
-def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
-    """Pack boxes with their context into mosaics, the tallest first."""
+def pack_boxes(boxes: IntArray, context_px: int) -> list[Mosaic]:
+    """Pack boxes with their context into mosaics, the tallest first.
+
+    They are cut out from and to multiples of `CROP_UNIT_PX` of the frame, so that the network's coarse pixels lie as in
+    the whole frame.
+    """
     if not len(boxes):
         return []
-    sizes = _windows_px(boxes, context_px)[:, 2:]
+    first = (boxes[:, :2] * CELL_PX - context_px) // CROP_UNIT_PX * CROP_UNIT_PX
+    sizes = -(-(boxes[:, 2:] * CELL_PX + context_px) // CROP_UNIT_PX) * CROP_UNIT_PX - first
     order = np.lexsort((sizes[:, 1], -sizes[:, 0]))
-    number, *corners = _shelve(sizes[order].tolist())
-    crops = np.column_stack([*corners, sizes[order]])
+    number, *places = _shelve(sizes[order].tolist())
+    crops = np.column_stack([*places, sizes[order]])
     ends = np.flatnonzero(np.diff(number)) + 1
-    parts = zip(np.split(order, ends), np.split(crops, ends), strict=True)
-    return [Mosaic((int((of[:, 0] + of[:, 2]).max()), int((of[:, 1] + of[:, 3]).max())), one, of) for one, of in parts]
-
-
-def _windows_px(boxes: Sequence[Box], context_px: int) -> IntArray:
-    """First row, first column, height and width (n, 4) of what is cut out: boxes with context, from and to multiples of
-    `CROP_UNIT_PX` of the frame, so that the network's coarse pixels lie as in the whole frame."""
-    cells = np.array(boxes) * CELL_PX
-    first = (cells[:, :2] - context_px) // CROP_UNIT_PX * CROP_UNIT_PX
-    last = -(-(cells[:, 2:] + context_px) // CROP_UNIT_PX) * CROP_UNIT_PX
-    return np.column_stack([first, last - first])
+    parts = zip(*(np.split(of, ends) for of in (order, crops, first[order])), strict=True)
+    return [Mosaic(tuple((of[:, :2] + of[:, 2:]).max(axis=0).tolist()), one, of, at) for one, of, at in parts]
 
 
 def _shelve(sizes: list[list[int]]) -> IntArray:
@@ -76,16 +71,13 @@ def _shelve(sizes: list[list[int]]) -> IntArray:
     return np.array(places).T
 
 
-def find_in_boxes(
-    detector: Detector,
-    frame: SearchableFrame,
-    boxes: Sequence[Box],
-    threshold: float | None,
-) -> Detections:
+def find_in_boxes(detector: Detector, frame: SearchableFrame, boxes: IntArray, threshold: float | None) -> Detections:
     """The candidates of a frame whose centres lie in some disjoint boxes, in the order of the boxes.
 
     Parameters
     ----------
+    boxes
+        (n, 4) of cells: first row, first column, row and column after the last.
     frame
         Resampled in the boxes and within `Detector.context_px` and `CROP_UNIT_PX` of them.
     threshold
@@ -100,17 +92,12 @@ def find_in_boxes(
 
 
 def _find_in_mosaic(
-    detector: Detector,
-    frame: SearchableFrame,
-    boxes: Sequence[Box],
-    mosaic: Mosaic,
-    threshold: float | None,
+    detector: Detector, frame: SearchableFrame, boxes: IntArray, mosaic: Mosaic, threshold: float | None
 ) -> tuple[Detections, IntArray]:
     """The candidates of a mosaic, in px of the frame, and the number of the box of each."""
-    placed, inner = mosaic.crops, np.array(boxes)[mosaic.numbers] * CELL_PX
-    corners = _windows_px(boxes, detector.context_px)[mosaic.numbers, :2]
-    image = assemble(frame.image, corners, mosaic, cv2.BORDER_REFLECT_101)
-    valid = assemble(frame.valid.view(np.uint8), corners, mosaic, cv2.BORDER_CONSTANT).view(np.bool_)
+    placed, corners, inner = mosaic.crops, mosaic.corners, boxes[mosaic.numbers] * CELL_PX
+    image = assemble(frame.image, mosaic, cv2.BORDER_REFLECT_101)
+    valid = assemble(frame.valid.view(np.uint8), mosaic, cv2.BORDER_CONSTANT).view(np.bool_)
     found = detector.find_in_crops(image, valid, placed, threshold=threshold)
     searched = np.column_stack([placed[:, :2] + inner[:, :2] - corners, inner[:, 2:] - inner[:, :2]])
     candidate, crop = find_owners(found.xy, searched, mosaic.shape)
@@ -128,10 +115,10 @@ def find_owners(xy: FloatArray, boxes: IntArray, shape: tuple[int, int]) -> tupl
     return position, box
 
 
-def assemble(image: GreyImage, corners: IntArray, mosaic: Mosaic, border: int) -> GreyImage:
-    """A mosaic of the windows of an image with these corners (n, 2); beyond the image they go on as OpenCV's border."""
+def assemble(image: GreyImage, mosaic: Mosaic, border: int) -> GreyImage:
+    """The windows of an image that a mosaic shows, put together; beyond the image they go on as OpenCV's border."""
     out, (height, width) = np.zeros(mosaic.shape, np.uint8), image.shape
-    for (row, column, rows, columns), (top, left) in zip(mosaic.crops.tolist(), corners.tolist(), strict=True):
+    for (row, column, rows, columns), (top, left) in zip(mosaic.crops.tolist(), mosaic.corners.tolist(), strict=True):
         bottom, right = top + rows, left + columns
         window = image[max(top, 0) : bottom, max(left, 0) : right]
         if window.shape != (rows, columns):

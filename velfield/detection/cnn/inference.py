@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import onnxruntime as ort
 
-from schemas.arrays import Float32Array, GreyImage, IntArray
+from schemas.arrays import ByteArray, Float32Array, GreyImage, IntArray
+from velfield.compiled import kernel
 from velfield.detection.cnn.graph import network_to_onnx
 from velfield.detection.cnn.network import ALIGNMENT, SIZE_LAYER, SIZE_STRIDE, STRIDE, Network
 from velfield.detection.cnn.quantization import INEXACT, Ranges, is_exact, quantized_to_onnx
@@ -165,13 +166,38 @@ def predict_crops(predict: Predictor, image: GreyImage, crops: IntArray) -> Heat
         at_once = 1 if tiled else max(1, _BATCH_PX // (height * width))
         for start in range(0, len(corners), at_once):
             some = corners[start : start + at_once]
-            pixels = np.stack([image[y : y + height, x : x + width] for y, x in some.tolist()])
+            pixels = _cut_kernel(image, some, height, width)
             if tiled:
                 heatmaps, vectors, of_crops = (part[None] for part in predict_heatmap(predict, pixels[0], border_px=0))
             else:
                 heatmaps, vectors, of_crops = predict(pixels)
-            for k, (y, x) in enumerate(some.tolist()):
-                part, coarse = (_window(y, x, height, width, stride) for stride in (STRIDE, SIZE_STRIDE))
-                probability[part], orientation[:, *part] = heatmaps[k], vectors[k]
-                sizes[:, *coarse] = of_crops[k]
+            _place_kernel(heatmaps[:, None], some // STRIDE, probability[None])
+            _place_kernel(vectors, some // STRIDE, orientation)
+            _place_kernel(of_crops, some // SIZE_STRIDE, sizes)
     return probability, orientation, sizes
+
+
+@kernel
+def _cut_kernel(image: ByteArray, corners: IntArray, height: int, width: int) -> ByteArray:
+    """Crops (n, height, width) with these corners (n, 2): y, x."""
+    out = np.empty((len(corners), height, width), np.uint8)
+    for n in range(len(corners)):
+        top, left = corners[n]
+        for row in range(height):
+            source, target = image[top + row], out[n, row]
+            for x in range(np.uint64(width)):
+                target[x] = source[np.uint64(left) + x]
+    return out
+
+
+@kernel
+def _place_kernel(maps: Float32Array, corners: IntArray, out: Float32Array) -> None:
+    """Write maps (n, channels, h, w) of crops where these lie (n, 2): y, x; ``out`` (channels, H, W)."""
+    channels, height, width = maps.shape[1:]
+    for n in range(len(corners)):
+        top, left = corners[n]
+        for channel in range(channels):
+            for row in range(height):
+                source, target = maps[n, channel, row], out[channel, top + row]
+                for x in range(np.uint64(width)):  # one by one: numba compiles an assigned slice for seconds
+                    target[np.uint64(left) + x] = source[x]

@@ -167,18 +167,12 @@ def are_mostly_visible(cars: FloatArray, shape: tuple[int, ...], valid: Mask | N
 
     The centre of a car that is truncated more is unreliable.
     """
-    everywhere = np.empty((0, 0), np.bool_) if valid is None else valid
-    return np.asarray(_visible_kernel(cars, shape[0], shape[1], everywhere))
-
-
-@kernel
-def _visible_kernel(cars: FloatArray, height: int, width: int, valid: Mask) -> Mask:
-    out = np.ones(len(cars), np.bool_)
-    for n in range(len(cars)):
-        for way in (-1.0, 1.0):
-            x = cars[n, 0] + way * _QUARTER_CAR_PX * math.cos(cars[n, 2])
-            y = cars[n, 1] + way * _QUARTER_CAR_PX * math.sin(cars[n, 2])
-            near_x, near_y = int(min(max(np.rint(x), 0), width - 1)), int(min(max(np.rint(y), 0), height - 1))
-            inside = abs(x - near_x) <= 0.5 and abs(y - near_y) <= 0.5
-            out[n] &= inside and (valid.size == 0 or valid[near_y, near_x])
-    return out
+    step = _QUARTER_CAR_PX * np.column_stack([np.cos(cars[:, 2]), np.sin(cars[:, 2])])
+    visible = np.ones(len(cars), np.bool_)
+    for xy in (cars[:, :2] - step, cars[:, :2] + step):
+        near = np.clip(np.rint(xy), 0, np.array(shape[1::-1]) - 1)
+        visible &= (np.abs(xy - near) <= 0.5).all(axis=1)
+        if valid is not None:
+            column, row = near.astype(np.int64).T
+            visible &= valid[row, column]
+    return visible
