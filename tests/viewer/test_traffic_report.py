@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from schemas.analysis import AnalysisRecord, EstimateRecord
-from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, drive, gather
+from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, crossroads, drive, gather
 from velfield.analysis.answers import duration_text
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.tables import all_tables, flow_table, limit_table
 from velfield.report.drawing import new_figure, pages_bytes
-from velfield.report.traffic.approaches import approach_delays, lane_names
+from velfield.report.traffic.approaches import approach_delays, arms_without_delay, lane_names
 from velfield.report.traffic.diagrams import draw_delays, draw_queues, draw_time_space, red_times, traffic_diagrams
 from velfield.report.traffic.first_page import FirstPage, first_page
 from velfield.report.traffic.report import report_html
@@ -34,6 +34,26 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
     )
     assert any(line.startswith("classes") for line in page.withheld)
     assert page.sections[-1][0].startswith("What is not known")
+
+
+def test_which_approach_waits_longest_is_not_said_where_a_delay_is_not_known(analysis: TrafficAnalysis) -> None:
+    """None comes from the north without a stop, to compare with: from the west vehicles wait less, or longer."""
+    (found,) = analysis.movements
+    assert arms_without_delay(found, approach_delays(analysis, found)) == ["N"]
+    answers = dict(first_page(analysis).answers)
+    waits = answers["Which approach waits longest, and how long are the queues?"]
+    assert waits[0].startswith("junction 0: which approach waits longest is not known, as the delay from N is not")
+    assert answers["Is there a signal, and is it fair?"][-1] == (
+        "junction 0: whether it is fair is not known: the delay from N is not"
+    )
+    assert sum(line.startswith("delay: ") for line in first_page(analysis).withheld) == 1
+
+
+def test_vehicles_on_lanes_without_a_junction_are_counted(analysis: TrafficAnalysis) -> None:
+    tracks = [*crossroads(), *(drive(np.array([[0.0, 30.0], [100.0, 30.0]]), 11.0 * k) for k in range(9))]
+    (where,) = (lines for question, lines in first_page(TrafficAnalysis(gather(tracks))).answers if "go?" in question)
+    assert re.fullmatch(r"lane \d+: 9 vehicles towards E; no junction was found on it", where[-1])
+    assert "no junction" not in " ".join(dict(first_page(analysis).answers)["Where do vehicles go?"])
 
 
 def test_a_short_clip_is_answered_by_what_is_missing() -> None:

@@ -10,6 +10,7 @@ from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
 from schemas.flight import STATIONARY_SPEED_M_PER_S
 from velfield.analysis.intervals import Estimate, estimate_event_rate
+from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import JunctionSignal, Queue, green_duration_s, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -69,6 +70,7 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
     yield _classes(analysis)
     yield from _movements(analysis)
     yield from _scene(analysis)
+    yield from _lanes_without_junction(analysis)
     yield from _speeds(analysis, unit)
     for number, signal in analysis.signals.items():
         if analysis.junction_kind(number) == "crossing":
@@ -167,6 +169,17 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
         share = _share_text(r.share, r.vehicles, r.origin.name)
         text = f"{count_text(r.vehicles, 'vehicle')}, {r.seen} of them tracked all the way{share}"
         yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
+
+
+def _lanes_without_junction(analysis: TrafficAnalysis) -> Iterator[Answer]:
+    """Vehicles on the lanes where no junction was found: they are in no movement."""
+    hulls = [junction.hull_m for junction in analysis.lanes.junctions]
+    lanes = [lane for lane in analysis.lanes if not any(inside_hull(lane.xy_m, hull).any() for hull in hulls)]
+    for lane in sorted(lanes, key=lambda lane: -lane.tracks):
+        ahead = lane.xy_m[-1] - lane.xy_m[len(lane.xy_m) // 2]
+        side = analysis.arm_names.side(float(np.arctan2(ahead[1], ahead[0])))
+        text = f"{count_text(lane.tracks, 'vehicle')} towards {side}; no junction was found on it"
+        yield Answer("other lanes", f"lane {lane.number}", "found", text)
 
 
 def _share_text(share: Estimate | None, vehicles: float, origin: str) -> str:

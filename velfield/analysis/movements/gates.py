@@ -71,6 +71,17 @@ class ArmNames:
         """What N stands for."""
         return "north is not known: N is the top of the image, W its left" if self.north_rad is None else "N is north"
 
+    def side(self, direction_rad: float) -> str:
+        """Name of a direction in the image, rad from x towards y (down).
+
+        Examples
+        --------
+        >>> ArmNames().side(np.pi / 2), ArmNames(north_rad=np.pi / 2).side(np.pi / 2)
+        ('S', 'N')
+        """
+        turned = 0.0 if self.north_rad is None else self.north_rad + np.pi / 2
+        return _COMPASS[round((direction_rad - turned) / (np.pi / 4)) % 8]
+
     def of(
         self,
         outward_rad: Mapping[int, float],
@@ -102,11 +113,7 @@ class ArmNames:
         >>> ArmNames(north_rad=0.0, given={"W1": "Mill Road"}).of({0: -1.6, 1: -1.5, 2: 0.0}, at)
         {0: 'W2', 1: 'Mill Road', 2: 'N'}
         """
-        turned = 0.0 if self.north_rad is None else self.north_rad + np.pi / 2
-        side = {
-            k: "inside" if k in inside else _COMPASS[round((a - turned) / (np.pi / 4)) % 8]
-            for k, a in outward_rad.items()
-        }
+        side = {k: "inside" if k in inside else self.side(a) for k, a in outward_rad.items()}
         names = dict(side)
         for name in set(side.values()):
             members = [k for k in side if side[k] == name]

@@ -124,6 +124,12 @@ class JunctionMovements:
         """Vehicles that passed."""
         return float(sum(m.seen + m.inferred for m in self.movements))
 
+    def entered(self, arm_in: str) -> float:
+        """Vehicles that entered by an arm, those that went ways too rare for a movement of their own among them."""
+        mine = [m for m in self.movements if m.arm_in == arm_in]
+        counted = sum(m.seen + m.inferred for m in mine)
+        return max([counted, *((m.seen + m.inferred) / m.share.value for m in mine if m.share)])
+
     def tracks(self, movement: Movement) -> IntArray:
         """Numbers of the tracks of a movement's vehicles whose both ends are known: those that enter."""
         name = np.array([self.gates.arms[gate.arm].name for gate in self.gates.gates] + [""])

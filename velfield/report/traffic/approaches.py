@@ -56,10 +56,31 @@ def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list
     return sorted(out, key=lambda one: -one.delay_s.value)
 
 
-def compare_delays(delays: Sequence[ApproachDelay]) -> str:
+def arms_without_delay(found: JunctionMovements, delays: Sequence[ApproachDelay]) -> list[str]:
+    """Arms by which vehicles enter a junction, and whose delay is not known."""
+    return sorted({m.arm_in for m in found.movements} - {d.arm for d in delays})
+
+
+def list_text(names: Sequence[str]) -> str:
+    """Names for people.
+
+    Examples
+    --------
+    >>> list_text(["N", "S", "W"])
+    'N, S and W'
+    """
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ()) -> str:
     """By how much the first approach, with the longest delay, waits longer than the last; or that none is shown to.
 
     The two are chosen by their delays, so the interval is that of the range of all of them.
+
+    Parameters
+    ----------
+    unknown
+        Arms whose delay is not known: vehicles may wait longest there.
 
     Examples
     --------
@@ -69,19 +90,27 @@ def compare_delays(delays: Sequence[ApproachDelay]) -> str:
     'it is not alike for all: vehicles from E wait 24 s (14 to 34) longer than those from W'
     >>> compare_delays([west, west])
     'no approach is shown to wait longer than another: their mean delays are within 0 s'
+    >>> compare_delays([west], ["E", "N"])
+    'whether it is fair is not known: the delay from E and N is not'
+    >>> compare_delays([west, west], ["N"])
+    'whether it is fair is not known: the delay from N is not; those from W and W are within 0 s'
     """
+    lacks = f"whether it is fair is not known: the delay from {list_text(unknown)} is not" if unknown else ""
     if len(delays) < 2:
-        return ""
+        return lacks
     longest, shortest = delays[0], delays[-1]
     sd_s = [(d.delay_s.high - d.delay_s.low) / (2 * stats.norm.ppf(0.95)) for d in (longest, shortest)]
     reach_s = float(stats.studentized_range.ppf(0.9, len(delays), np.inf)) * hypot(*sd_s) / sqrt(2)
     by_s = longest.delay_s.value - shortest.delay_s.value
     part = ", as far as is seen" if longest.partly or shortest.partly else ""
+    if by_s < reach_s and lacks:
+        return f"{lacks}; those from {list_text([d.arm for d in delays])} are within {by_s:.0f} s"
     if by_s < reach_s:
         return f"no approach is shown to wait longer than another{part}: their mean delays are within {by_s:.0f} s"
     return (
         f"it is not alike for all: vehicles from {longest.arm} wait {by_s:.0f} s ({by_s - reach_s:.0f} to "
         f"{by_s + reach_s:.0f}) longer than those from {shortest.arm}{part}"
+        + (f"; the delay from {list_text(unknown)} is not known" if unknown else "")
     )
 
 

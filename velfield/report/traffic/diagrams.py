@@ -17,7 +17,7 @@ from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import count_text
 from velfield.report.colours import TONES
-from velfield.report.traffic.approaches import ApproachDelay, approach_delays, lane_names
+from velfield.report.traffic.approaches import ApproachDelay, approach_delays, arms_without_delay, lane_names, list_text
 from velfield.report.traffic.place import draw_junctions_aside, draw_map, draw_place, place_caption, place_labels
 from velfield.report.traffic.turning import draw_turning, turning_height_in
 
@@ -79,14 +79,14 @@ def traffic_diagrams(
         )
         delays = approach_delays(analysis, found)
         if delays:
-            unknown = sorted({m.arm_in for m in found.movements} - {d.arm for d in delays})
+            unknown = arms_without_delay(found, delays)
             yield Diagram(
                 f"delay-{found.junction.number}",
                 f"Junction {found.junction.number}: delay and level of service by approach",
                 "Mean delay against vehicles that pass freely, in view, up to 150 m before the junction, of those that "
                 "were seen for 60 m; black lines: its 90 % interval. Or worse: the queue ends out of view. Level of "
                 "service by the Highway Capacity Manual, 7th edition (A: best, F: worst), between the dashed lines."
-                + (f" Too few were seen to know it from {' and '.join(unknown)}." if unknown else ""),
+                + (f" Too few were seen to know it from {list_text(unknown)}." if unknown else ""),
                 partial(draw_delays, delays=delays),
                 1.5 + 0.4 * len(delays),
             )

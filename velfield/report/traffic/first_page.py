@@ -9,7 +9,13 @@ from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import Queue
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import count_text
-from velfield.report.traffic.approaches import ApproachDelay, approach_delays, compare_delays
+from velfield.report.traffic.approaches import (
+    ApproachDelay,
+    approach_delays,
+    arms_without_delay,
+    compare_delays,
+    list_text,
+)
 
 _PER_QUESTION = 4
 _NO_DELAY = "delay not known"
@@ -42,7 +48,8 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     withheld: list[str] = []
     reasons: dict[str, list[str]] = {}
     delays = {found.junction.number: approach_delays(analysis, found) for found in analysis.movements}
-    fairness = {f"junction {number}": compare_delays(known) for number, known in delays.items()}
+    unknown = {m.junction.number: arms_without_delay(m, delays[m.junction.number]) for m in analysis.movements}
+    fairness = {f"junction {number}": compare_delays(known, unknown[number]) for number, known in delays.items()}
     for answer in find_answers(analysis, unit=unit):
         place = f"{answer.subject}: " if answer.subject else ""
         text = place + answer.text
@@ -55,11 +62,13 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
                 found["signal"].append(place + fairness[answer.subject])
 
     waits: list[str] = []
+    longest_waits: list[str] = []
     for found_at in _met(analysis):
         number, longest = found_at.junction.number, longest_queues(analysis, found_at)
         waits += _approaches(found_at, delays[number], longest)
-        for arm in set(longest) - {d.arm for d in delays[number]}:
-            withheld.append(f"delay: junction {number} from {arm}: {_WHY_NO_DELAY}")
+        if unknown[number] and (longest or delays[number]):
+            withheld.append(f"delay: junction {number} from {list_text(unknown[number])}: {_WHY_NO_DELAY}")
+            longest_waits.append(f"junction {number}: {_longest_wait(unknown[number], longest)}")
 
     def why(topic: str, otherwise: str) -> str:
         return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
@@ -70,12 +79,16 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     questions = (
         (
             "Where do vehicles go?",
-            [*_few(found.get("movement") or found.get("through", [])), *found.get("merging", [])],
+            [
+                *_few(found.get("movement") or found.get("through", [])),
+                *found.get("merging", []),
+                *(_few(found.get("other lanes", [])) if "movement" in found or "through" not in found else []),
+            ],
             "no turn was seen three times",
         ),
         (
             "Which approach waits longest, and how long are the queues?",
-            _few(waits),
+            [*_few(longest_waits), *_few(waits)],
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
         ("Is there a signal, and is it fair?", _few(found.get("signal", [])), why("signal", no_signal)),
@@ -104,13 +117,24 @@ def _met(analysis: TrafficAnalysis) -> list[JunctionMovements]:
     return sorted((m for m in analysis.movements if analysis.ways_meet(m.junction.number)), key=lambda m: -m.volume)
 
 
+def _longest_wait(unknown: list[str], longest: Mapping[str, Queue]) -> str:
+    """That it is not known which approach of a junction waits longest; and which has the longest queue, if one has."""
+    by_length = sorted(longest, key=lambda arm: -longest[arm].length_m)
+    text = f"which approach waits longest is not known, as the delay from {list_text(unknown)} is not"
+    sure = len(by_length) > 1 and longest[by_length[0]].vehicles.low > longest[by_length[1]].vehicles.high
+    return f"{text}; the longest queue is that from {by_length[0]}" if sure else text
+
+
 def _approaches(found: JunctionMovements, known: list[ApproachDelay], longest: Mapping[str, Queue]) -> list[str]:
-    """A line on each approach of a junction with a known delay or queue: that which waits longest first."""
+    """A line on each approach of a junction with a known delay or queue: that which waits longest first, or that with
+    the longest queue where a delay is not known."""
     delays = {delay.arm: delay for delay in known}
+    names = list(dict.fromkeys((*delays, *longest)))
+    if arms_without_delay(found, known):
+        names.sort(key=lambda name: -longest[name].length_m if name in longest else 0.0)
     out = []
-    for name in (*delays, *(name for name in longest if name not in delays)):
-        entered = sum(m.seen + m.inferred for m in found.movements if m.arm_in == name)
-        said = [count_text(entered, "vehicle")]
+    for name in names:
+        said = [count_text(found.entered(name), "vehicle")]
         said.append(f"mean delay {delays[name].text}" if name in delays else _NO_DELAY)
         if name in longest:
             said.append(f"longest queue of a lane when green begins {queue_text(longest[name])}")

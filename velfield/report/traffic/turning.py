@@ -94,7 +94,7 @@ def _label(arm: Arm, movements: list[Movement], found: JunctionMovements) -> lis
         comes = arm.name in found.gates.arms_in.values()
         return [f"{arm.name}: no turns known from there" if comes else f"{arm.name}: vehicles only leave by it"]
     counted = sum(m.seen + m.inferred for m in movements)
-    total = max([counted, *((m.seen + m.inferred) / m.share.value for m in movements if m.share)])
+    total = found.entered(arm.name)
     lines = [
         f"to {m.arm_out}: {m.seen + m.inferred:.0f}" + (f" ({100 * m.share.value:.0f} %)" if m.share else "")
         for m in movements
