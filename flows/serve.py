@@ -131,50 +131,41 @@ def deployments(config: ServeConfig) -> list["RunnerDeployment"]:
     from prefect.events import DeploymentEventTrigger
     from prefect.types.entrypoint import EntrypointType
 
+    def make(flow: Any, name: str, description: str, parameters: dict[str, str], **when: Any) -> Any:
+        where_from: Any = {"entrypoint_type": EntrypointType.MODULE_PATH, "parameters": parameters}
+        return flow.to_deployment(name=name, description=description, **where_from, **when)
+
+    def on(name: str, event: str, **parameters: str) -> dict[str, Any]:
+        return {"triggers": [DeploymentEventTrigger(name=name, expect={event}, parameters=parameters)]}
+
     from flows.deployed import process_dropped, reprocess_runs
 
     where = {"runs": str(config.runs), "cluster": config.cluster}
     images = {"base_images": str(config.base_images), "base": "", "run": ""}
-    dropped = process_dropped.to_deployment(
-        name="watched-folder",
-        description="A flight was dropped into the watched folder.",
-        parameters={"source": "", **where},
-        triggers=[
-            DeploymentEventTrigger(
-                name="flight arrived",
-                expect={FLIGHT_ARRIVED},
-                parameters={"source": "{{ event.payload.source }}", **where},
-            )
-        ],
-        entrypoint_type=EntrypointType.MODULE_PATH,
-    )
-    arrived = reprocess_runs.to_deployment(
-        name="base-image-arrived",
-        description="A new base image: every run, or the one that the event names, gets a result on it.",
-        parameters={**images, **where},
-        triggers=[
-            DeploymentEventTrigger(
-                name="base image arrived",
-                expect={BASE_IMAGE_ARRIVED},
-                parameters={
-                    **images,
-                    **where,
-                    "base": "{{ event.payload.base }}",
-                    "run": "{{ event.payload.run }}",
-                },
-            )
-        ],
-        entrypoint_type=EntrypointType.MODULE_PATH,
-    )
-    nightly = reprocess_runs.to_deployment(
-        name="nightly",
-        description="The newest base image under every run that has no result on it yet.",
-        cron=config.nightly,
-        parameters={**images, **where},
-        entrypoint_type=EntrypointType.MODULE_PATH,
-    )
-    made: list[Any] = [dropped, arrived, nightly]  # awaitable only where called in a coroutine
-    return made
+    flight, image = "{{ event.payload.source }}", {"base": "{{ event.payload.base }}", "run": "{{ event.payload.run }}"}
+    return [
+        make(
+            process_dropped,
+            "watched-folder",
+            "A flight was dropped into the watched folder.",
+            {"source": "", **where},
+            **on("flight arrived", FLIGHT_ARRIVED, source=flight, **where),
+        ),
+        make(
+            reprocess_runs,
+            "base-image-arrived",
+            "A new base image: every run, or the one that the event names, gets a result on it.",
+            {**images, **where},
+            **on("base image arrived", BASE_IMAGE_ARRIVED, **{**images, **where, **image}),
+        ),
+        make(
+            reprocess_runs,
+            "nightly",
+            "The newest base image under every run that has no result on it yet.",
+            {**images, **where},
+            cron=config.nightly,
+        ),
+    ]
 
 
 @contextlib.contextmanager

@@ -130,28 +130,26 @@ def run(
         "position_y_axis": y_axis,
     }
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
+    options = {
+        "labels": labels, "detector": detector, "detections": detections, "timestamps": timestamps,
+        "telemetry": telemetry,
+    }  # fmt: skip
+    given = {name: str(path) for name, path in options.items() if path is not None}
+    path = tracks
     if tracks is not None or source is None:
-        frames_only = {
-            "VIDEO": source, "--labels": labels, "--detector": detector, "--detections": detections,
-            "--timestamps": timestamps, "--telemetry": telemetry, "--device": device,
-        }  # fmt: skip
-        inputs = _tracks_inputs(tracks, base, [name for name, value in frames_only.items() if value is not None])
-    else:
+        frames_only = ["VIDEO"] * (source is not None) + [f"--{name}" for name in given]
+        _check_tracks(tracks, frames_only + ["--device"] * (device is not None))
+    elif more:
         from velfield.pipeline.plan import write_clips
 
-        inputs = Inputs(
-            source=str(write_clips(out, (source, *more)) if more else source),
-            base=_text(base),
-            labels=_text(labels),
-            detector=_text(detector),
-            detections=_text(detections),
-            timestamps=_text(timestamps),
-            telemetry=_text(telemetry),
-        )
+        path = write_clips(out, (source, *more))
+    else:
+        path = source
+    inputs = Inputs(source=str(path), base=None if base is None else str(base), **given)
     job = Job(root=str(out), inputs=inputs, config=resolved)
     where, verbosity = choose_runner(workers, scheduler, cluster), _verbosity(quiet, verbose, log_json)
     if plan:
-        print(_describe_plan(job, where) if tracks is None else _describe_tracks(job))
+        print(_describe_plan(job, where, of_tracks=tracks is not None))
         return DONE
     if tracks is not None:
         return _process_tracks(job, where, verbosity)
@@ -162,13 +160,12 @@ def run(
     return status
 
 
-def _tracks_inputs(tracks: Path | None, base: Path | None, frames_only: list[str]) -> Inputs:
-    """Inputs of a run of given tracks; ``frames_only``: options that were given and need frames."""
+def _check_tracks(tracks: Path | None, frames_only: list[str]) -> None:
+    """Refuse a run without frames that has no tracks, or options that were given and need frames."""
     if tracks is None:
         raise InputError("no input; give a video, a folder of images, or --tracks FILE")
     if frames_only:
         raise InputError(f"--tracks cannot be combined with {', '.join(frames_only)}: tracks have no frames")
-    return Inputs(source=str(tracks), base=_text(base))
 
 
 def process(job: Job, *, runner: "RunnerConfig | None" = None, verbosity: "Verbosity" = "normal") -> int:
@@ -241,7 +238,11 @@ def conclude(summary: "RunSummary", console: "Console") -> int:
     return INCOMPLETE
 
 
-def _describe_plan(job: Job, runner: "RunnerConfig") -> str:
+def _describe_plan(job: Job, runner: "RunnerConfig", *, of_tracks: bool) -> str:
+    if of_tracks:
+        from velfield.pipeline.given_tracks.plan import describe_tracks
+
+        return describe_tracks(job)
     from flows.runners import parallel_units
     from velfield.pipeline.check_inputs import validate_inputs
     from velfield.pipeline.estimate import describe_plan
@@ -252,22 +253,12 @@ def _describe_plan(job: Job, runner: "RunnerConfig") -> str:
     return describe_plan(plan, parallel_units(runner))
 
 
-def _describe_tracks(job: Job) -> str:
-    from velfield.pipeline.given_tracks.plan import describe_tracks
-
-    return describe_tracks(job)
-
-
 def _every(text: str | None) -> int | str | None:
     if text is None or text == "auto":
         return text
     if not text.isdigit() or int(text) < 1:
         raise InputError(f"--every {text}: must be a positive integer, or auto")
     return int(text)
-
-
-def _text(path: Path | None) -> str | None:
-    return None if path is None else str(path)
 
 
 def _verbosity(quiet: bool, verbose: bool, log_json: bool) -> "Verbosity":

@@ -172,11 +172,9 @@ def _record(before: GeoreferenceRecord, points: ControlPointsRecord) -> Georefer
 
 
 def _summary(plan: Plan) -> RunSummary:
-    stages = []
-    for stage in STAGES:
-        records = read_commits(plan.layout, stage.name)
-        stages.append(summarise_stage(stage.name, records, units=len(records), before=records, seconds=0.0))
-    return summarise_run(plan, stages)
+    found = {stage.name: read_commits(plan.layout, stage.name) for stage in STAGES}
+    done = [summarise_stage(name, one, units=len(one), before=one, seconds=0.0) for name, one in found.items()]
+    return summarise_run(plan, done)
 
 
 def _notes(before_m: float | None, points: ControlPointsRecord, changed: float) -> list[str]:

@@ -100,8 +100,8 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
     length = vector_length(plan.info.width, plan.info.height, config)
     vectors = np.full((len(frames), length), np.nan)
     columns = {name: np.full(len(frames), fill_value(dtype), dtype) for name, dtype in REGISTRATION_COLUMNS.items()}
-    errors = np.full((len(frames), *ERROR_CELLS), np.nan, np.float32)
-    position_sd = np.full((len(frames), *POSITION_SD_CELLS), np.nan, np.float32)
+    cells = {"error_px": ERROR_CELLS, "position_sd_px": POSITION_SD_CELLS}
+    by_cell = {name: np.full((len(frames), *shape), np.nan, np.float32) for name, shape in cells.items()}
     statuses = []
     for k, frame in enumerate(frames):
         result = results.get(frame)
@@ -113,12 +113,11 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
             vectors[k] = result.transform.to_vector(config)
         for name in columns:
             columns[name][k] = getattr(result, name)
-        if result.error_map is not None:
-            errors[k] = result.error_map
-        if result.position_sd_px is not None:
-            position_sd[k] = result.position_sd_px
+        for name, values in (("error_px", result.error_map), ("position_sd_px", result.position_sd_px)):
+            if values is not None:
+                by_cell[name][k] = values
     store = RegistrationStore(plan.layout.registration, "r+")
-    store.write(frames.start, vectors, statuses, {**columns, "error_px": errors, "position_sd_px": position_sd})
+    store.write(frames.start, vectors, statuses, {**columns, **by_cell})
     registered = statuses.count("ok")
     counts = {"frames": float(len(frames)), "registered": float(registered)}
     if registered:
