@@ -70,6 +70,29 @@ def test_the_graph_has_the_turn_and_nothing_else(avenue: LaneGraph) -> None:
     assert len(avenue.exits) == 4
 
 
+STREET = np.array([[80.0, 0.0], [80.0, 150.0]])
+
+
+def right_turn(radius_m: float) -> FloatArray:
+    """From the avenue, right into the street that crosses it."""
+    start = 80.0 - radius_m
+    return np.concatenate(
+        [[[0.0, 50.0], [start, 50.0]], arc((start, 50.0 + radius_m), radius_m, -90, 0), [[80.0, 150.0]]]
+    )
+
+
+@pytest.mark.parametrize("radius_m", [5.0, 8.0, 12.0])
+@pytest.mark.parametrize("sd_m", [0.05, 0.2, 0.4])
+def test_a_turn_of_three_vehicles_is_a_lane_whatever_its_radius_and_their_errors(radius_m: float, sd_m: float) -> None:
+    crossing, turn = [AVENUE] * 9 + [STREET] * 9, right_turn(radius_m)
+    graph = graph_of([driven(path) for path in [*crossing, *[turn] * 3]], sd_m=sd_m)
+    assert len(graph) == 5
+    (short,) = (lane for lane in graph if lane.length_m < 30)
+    assert [c.tracks for c in graph.connections if short.number in (c.start, c.end)] == [3, 3]
+    assert np.abs(project(short.xy_m, turn)[1]).max() < 2 * sd_m + 0.6
+    assert len(graph_of([driven(path) for path in [*crossing, *[turn] * 2]], sd_m=sd_m)) == 2
+
+
 def test_lanes_of_one_direction_are_neighbours(avenue: LaneGraph) -> None:
     lane = max((lane for lane in avenue if lane.width_source == "neighbour"), key=lambda lane: lane.length_m)
     assert lane.width_m == pytest.approx(3.5, abs=0.35)

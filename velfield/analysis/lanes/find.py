@@ -7,10 +7,11 @@ from scipy.spatial import cKDTree
 
 from schemas.analysis import Turn, WidthSource
 from schemas.arrays import FloatArray, IntArray
-from velfield.analysis.lanes.graph import Chains, count_links, make_chains, number_chains
+from velfield.analysis.lanes.graph import Chains, count_links, link_chains, make_chains, number_chains
 from velfield.analysis.lanes.junctions import find_junctions
 from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
+from velfield.analysis.lanes.turns import add_turns
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, group_rows, sample_paths
 from velfield.compiled import kernel
 
@@ -49,6 +50,8 @@ def find_lanes(
     bins, bin_of = bin_samples(samples, keys)
     nodes = find_nodes(bins, min_weight=float(min_tracks), position_sd_m=trajectories.position_sd_m)
     node = nodes.of_bin[bin_of]
+    ridges = link_chains(nodes, count_links(samples.track, node, nodes))
+    nodes, node = add_turns(nodes, node, samples, ridges, min_tracks=min_tracks)
     chains = make_chains(nodes, count_links(samples.track, node, nodes), min_tracks=min_tracks)
     chains = _drop_rare(chains, samples.track, node, len(nodes), min_tracks)
     if not chains.nodes:

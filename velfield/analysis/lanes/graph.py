@@ -53,16 +53,17 @@ class Chains:
 def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:
     """Links of consecutive samples' nodes; samples are in order along each track, ``node`` -1: none."""
     first, second = _moves(track, node)
-    a, b, owner = node[first], node[second], track[first]
+    # by hashing: there are few pairs of nodes
+    number, pairs = pd.factorize(node[first] * np.int64(len(nodes)) + node[second])
+    count = count_once(track[first], number, len(pairs))
+    order = np.argsort(pairs)
+    a, b = np.divmod(np.asarray(pairs, np.int64)[order], len(nodes))
     step = nodes.xy_m[b] - nodes.xy_m[a]
     # where a track leaves a lane, the node that it leaves may be farther along than the one that it goes to
     ways = [of(nodes.direction_rad[a]) + of(nodes.direction_rad[b]) for of in (np.cos, np.sin)]
     ahead = ways[0] * step[:, 0] + ways[1] * step[:, 1]
     ok = (np.hypot(step[:, 0], step[:, 1]) < _MAX_STEP_M) & (ahead > 0)
-    # by hashing: there are few pairs of nodes
-    number, pairs = pd.factorize(a[ok] * np.int64(len(nodes)) + b[ok], sort=True)
-    pairs, count = np.asarray(pairs, np.int64), count_once(owner[ok], number, len(pairs))
-    return Links(pairs // len(nodes), pairs % len(nodes), count)
+    return Links(a[ok], b[ok], count[order][ok])
 
 
 def _moves(track: IntArray, node: IntArray) -> tuple[IntArray, IntArray]:
@@ -78,8 +79,13 @@ def count_once(owner: IntArray, number: IntArray, n: int) -> IntArray:
     return np.bincount(pd.unique(owner * np.int64(n) + number) % n, minlength=n)
 
 
-def make_chains(nodes: Nodes, links: Links, *, min_tracks: int) -> Chains:
-    """Lanes and connections that at least ``min_tracks`` take."""
+def link_chains(nodes: Nodes, links: Links) -> list[IntArray]:
+    """Numbers of the nodes of each chain of nodes that are each other's best successor and predecessor."""
+    return _walk(*_best_links(nodes, links))
+
+
+def _best_links(nodes: Nodes, links: Links) -> tuple[IntArray, IntArray]:
+    """The node after, and before, each node (n,) on its chain; -1: none."""
     follows, precedes = (
         _best(links.start, links.end, links.tracks, len(nodes)),
         _best(links.end, links.start, links.tracks, len(nodes)),
@@ -88,6 +94,12 @@ def make_chains(nodes: Nodes, links: Links, *, min_tracks: int) -> Chains:
     after = np.where(linked, follows, -1)
     before = np.full(len(nodes), -1)
     before[after[linked]] = np.flatnonzero(linked)
+    return after, before
+
+
+def make_chains(nodes: Nodes, links: Links, *, min_tracks: int) -> Chains:
+    """Lanes and connections that at least ``min_tracks`` take."""
+    after, before = _best_links(nodes, links)
     for _ in range(3):
         chains = _walk(after, before)
         drop = _stubs(chains, nodes, links, min_tracks)
@@ -137,23 +149,25 @@ def number_chains(chains: list[IntArray], n: int) -> IntArray:
 
 
 def _stubs(chains: list[IntArray], nodes: Nodes, links: Links, min_tracks: int) -> Mask:
-    """Nodes of short chains that lead from nowhere, or to nowhere."""
+    """Nodes of short chains that lead from nowhere, or to nowhere, or from one chain to the same."""
     chain_of = number_chains(chains, len(nodes))
     entered = _linked(links.end, chain_of[links.start], links.tracks, len(nodes), min_tracks)
     left = _linked(links.start, chain_of[links.end], links.tracks, len(nodes), min_tracks)
     drop = np.zeros(len(nodes), bool)
     for chain in chains:
         length = np.hypot(*np.diff(nodes.xy_m[chain], axis=0).T).sum()
-        if length < _STUB_M and not (entered[chain[0]] and left[chain[-1]]):
+        ways = entered.get(int(chain[0]), set()), left.get(int(chain[-1]), set())
+        if length < _STUB_M and (not all(ways) or len(set.union(*ways)) == 1):
             drop[chain] = True
     return drop
 
 
-def _linked(node: IntArray, chain: IntArray, tracks: IntArray, n: int, min_tracks: int) -> Mask:
-    """(n,) nodes that enough tracks link with one chain: few may leave it at the same one of its nodes."""
+def _linked(node: IntArray, chain: IntArray, tracks: IntArray, n: int, min_tracks: int) -> dict[int, set[int]]:
+    """Chains with which enough tracks link each node: few may leave a chain at the same one of its nodes."""
     pairs, number = np.unique(chain * np.int64(n) + node, return_inverse=True)
-    out = np.zeros(n, bool)
-    out[pairs[np.bincount(number, tracks) >= min_tracks] % n] = True
+    out: dict[int, set[int]] = {}
+    for pair in pairs[np.bincount(number, tracks) >= min_tracks].tolist():
+        out.setdefault(pair % n, set()).add(pair // n)
     return out
 
 
