@@ -14,6 +14,7 @@ from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.intervals import estimate_censored_quantile, estimate_quantile, estimate_rate, estimate_share
 from velfield.analysis.movements.gates import Arm, Gate, Gates
 from velfield.analysis.movements.movements import furness
+from velfield.analysis.movements.reversals import Reversal, seen_whole_s
 from velfield.analysis.signals.coordination import queue_growth
 from velfield.analysis.signals.cycles import find_signal, queues
 from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
@@ -281,6 +282,8 @@ def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
     tracks += [drive(SOUTH, 4.0 * k + 5.7) for k in range(12)]
     analysis = TrafficAnalysis(gather(tracks))
     assert [r.left for r in analysis.reversals] == [True]
+    # half a circle of 7 m radius and 8 m of each leg, at 12 m/s, with what smoothing adds
+    assert analysis.reversals[0].takes_s == pytest.approx((np.pi * 7 + 16) / 12, abs=1.0)
     assert "wrong way" in {u.kind for u in analysis.unusual}
     assert {u.track for u in analysis.unusual if u.kind == "wrong way"} == {12}
     crossing = [c for c in find_conflicts(analysis.trajectories, analysis.lane_traffic) if c.kind == "crossing"]
@@ -289,6 +292,18 @@ def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
     first = min(crossing, key=lambda c: c.value_s)
     assert first.value_s == pytest.approx(14.03 - 12.5 - 6.3 / 12, abs=0.1)
     assert 0.5 < first.probability <= 1.0
+
+
+def test_u_turns_that_the_ends_of_short_clips_cut_do_not_bias_their_rate() -> None:
+    rng = np.random.default_rng(3)
+    takes_s, clip_s, clips, per_s = 20.0, 60.0, 4000, 1 / 30
+    begin = np.sort(rng.uniform(0, clip_s * clips, rng.poisson(clip_s * clips * per_s)))
+    whole = np.floor(begin / clip_s) == np.floor((begin + takes_s) / clip_s)
+    found = [Reversal(0, float(t), np.zeros(2), True, takes_s) for t in begin[whole]]
+    clips_s = clip_s * np.arange(clips)[:, None] + [0, clip_s]
+    assert len(found) / seen_whole_s(found, clips_s) == pytest.approx(per_s, rel=0.05)
+    assert seen_whole_s([], clips_s[:1]) < clip_s
+    assert seen_whole_s([], clips_s[:0]) == 0
 
 
 @pytest.mark.parametrize("wobble_m", [0.0, 0.5])

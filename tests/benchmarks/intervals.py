@@ -89,7 +89,7 @@ class Clip:
         yield from self._lanes()
         yield from self._signals()
         true, found = (
-            estimate_event_rate(len(a.reversals), a.trajectories.duration_s / 3600)
+            estimate_event_rate(len(a.reversals), a.reversals_seen_s / 3600)
             for a in (self.long_run.analysis, self.analysis)
         )
         yield Interval("U-turns an hour", true.value, found)

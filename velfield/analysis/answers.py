@@ -83,10 +83,8 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
             yield Answer(
                 "queue", f"junction {found.junction.number} from {arm}", "found", text, queue.vehicles, "vehicles"
             )
-    seconds = analysis.trajectories.duration_s
-    yield _events(
-        "u-turns", len(analysis.reversals), seconds, _places([_near(analysis, r.xy_m) for r in analysis.reversals])
-    )
+    places = _places([_near(analysis, r.xy_m) for r in analysis.reversals])
+    yield _events("u-turns", analysis, len(analysis.reversals), places)
     yield _conflicts(analysis)
     yield _unusual(analysis)
 
@@ -110,7 +108,7 @@ def explain_none(topic: str, analysis: TrafficAnalysis) -> str:
     """Why a table is empty: how rare the events of ``topic`` are at most, too little data, or none found."""
     seconds, tracks = analysis.trajectories.duration_s, len(analysis.trajectories)
     if topic in ("u_turns", "conflicts", "unusual"):
-        return f"{_events(topic, 0, seconds).text.capitalize()}."
+        return f"{_events(topic.replace('_', '-'), analysis, 0).text.capitalize()}."
     if seconds < _SHORT_S or tracks < _FEW_TRACKS:
         return f"Too little data: {seen_text(analysis.trajectories)}."
     return "None found."
@@ -271,9 +269,7 @@ def _conflicts(analysis: TrafficAnalysis) -> Answer:
     if not likely and np.prod([1.0 - c.probability for c in analysis.conflicts]) < 0.5:
         text = "pairs may have been less than 1.5 s apart, which positions with such errors do not settle"
         return Answer("conflicts", "", "too little data", f"too little data: {text}")
-    return _events(
-        "conflicts", len(likely), analysis.trajectories.duration_s, f"{kinds}, probably less than 1.5 s apart"
-    )
+    return _events("conflicts", analysis, len(likely), f"{kinds}, probably less than 1.5 s apart")
 
 
 def _places(found: Sequence[str]) -> str:
@@ -300,13 +296,15 @@ def _unusual(analysis: TrafficAnalysis) -> Answer:
         f"{u.kind} at {u.time_s:.1f} s (frame {u.frame}, track {ids[u.track]}): {u.detail}"
         for u in analysis.unusual[:3]
     )
-    return _events("unusual", len(analysis.unusual), analysis.trajectories.duration_s, first)
+    return _events("unusual", analysis, len(analysis.unusual), first)
 
 
-def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
+def _events(topic: str, analysis: TrafficAnalysis, n: int, detail: str = "") -> Answer:
     """A number of events, and how many an hour that is; of none how rare they are at least."""
+    seconds = analysis.trajectories.duration_s
+    hours = (analysis.reversals_seen_s if topic == "u-turns" else seconds) / 3600
     if n:
-        rate = estimate_event_rate(n, seconds / 3600) if seconds >= _SHORT_S else None
+        rate = estimate_event_rate(n, hours) if seconds >= _SHORT_S else None
         often = ", too short to say how often"
         if rate and n < _FEW_EVENTS:  # the middle of so wide an interval would be quoted as if it were known
             often = f", {rate.low:.0f} to {rate.high:.0f} an hour"
@@ -317,7 +315,7 @@ def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
     if seconds < _SHORT_S:
         text = f"none was seen in {duration_text(seconds)}, too short a time to say how rare they are"
         return Answer(topic, "", "too little data", text)
-    hourly = estimate_event_rate(0, seconds / 3600).high
+    hourly = estimate_event_rate(0, hours).high
     fewer = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
     text = f"none in {duration_text(seconds)}, so fewer than {fewer} an hour with 90 % probability"
     return Answer(topic, "", "none", text, at_most_per_h=hourly)

@@ -28,7 +28,7 @@ from velfield.analysis.movements.car_parks import CarPark, find_car_parks
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.movements import JunctionMovements, find_movements
-from velfield.analysis.movements.reversals import Reversal, find_reversals
+from velfield.analysis.movements.reversals import Reversal, find_reversals, seen_whole_s
 from velfield.analysis.movements.scene import OriginDestination, find_origins_destinations
 from velfield.analysis.movements.time_slices import (
     SLICE_S,
@@ -156,6 +156,11 @@ class TrafficAnalysis:
     def reversals(self) -> list[Reversal]:
         """U-turns."""
         return find_reversals(self.samples, self.lanes, position_sd_m=self.trajectories.position_sd_m)
+
+    @cached_property
+    def reversals_seen_s(self) -> float:
+        """Time in which a U-turn may begin that is seen whole."""
+        return seen_whole_s(self.reversals, self.trajectories.observed_s)
 
     @cached_property
     def stops(self) -> Stops:

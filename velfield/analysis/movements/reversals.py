@@ -1,5 +1,6 @@
 """U-turns: tracks that reverse their direction within a short path, on a road where others go on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,15 +30,22 @@ _ARM_M = 20
 _CIRCLE_RAD = np.radians(215)
 """Who turns by more goes round a circle: it is entered, and left, by a bend the other way."""
 
+_TAKES_S = 12.0
+"""A U-turn takes about so long with the ways before it and after it, where none was seen."""
+_LEAST_SEEN = 0.5
+"""In a short time at least this share of it counts: few U-turns say little of how long they take."""
+
 
 @dataclass(frozen=True)
 class Reversal:
-    """A U-turn: number of the track, middle of the turn and its time; ``left`` or to the right."""
+    """A U-turn: number of the track, middle of the turn and its time; ``left`` or to the right; ``takes_s``: time from
+    the way before it to the way after it, which both must be seen."""
 
     track: int
     time_s: float
     xy_m: FloatArray
     left: bool
+    takes_s: float
 
 
 def find_reversals(samples: PathSamples, graph: LaneGraph, *, position_sd_m: float = 0.0) -> list[Reversal]:
@@ -59,26 +67,44 @@ def find_reversals(samples: PathSamples, graph: LaneGraph, *, position_sd_m: flo
         best = int(group[np.argmax(np.abs(turn[group]))])
         middle = best + _PATH_M // 2
         inside_ring = any(inside_hull(samples.xy_m[[middle]], hull)[0] for hull in rings)
-        if not inside_ring and _comes_by_road(samples, best) and _goes_back(samples, course, best, position_sd_m):
-            track = int(samples.track[middle])
-            out.append(Reversal(track, float(samples.time_s[middle]), samples.xy_m[middle], bool(turn[best] < 0)))
+        if inside_ring or not _comes_by_road(samples, best):
+            continue
+        legs = _legs(samples, course, best, position_sd_m)
+        if legs:
+            track, takes_s = int(samples.track[middle]), float(np.diff(samples.time_s[list(legs)])[0])
+            left = bool(turn[best] < 0)
+            out.append(Reversal(track, float(samples.time_s[middle]), samples.xy_m[middle], left, takes_s))
     return sorted(out, key=lambda row: row.time_s)
 
 
-def _goes_back(samples: PathSamples, course: FloatArray, row: int, position_sd_m: float) -> bool:
-    """Whether the track goes one way before the turn, and the other after it, farther than errors explain."""
+def seen_whole_s(reversals: Sequence[Reversal], observed_s: FloatArray) -> float:
+    """Length of the times in which such U-turns may begin and are seen whole, of times (k, 2) that are seen, s.
+
+    One that takes long is seen whole where it begins so long before the end of a time: with each as often as the times
+    that it has are short, their number over this length is the rate at which they come.
+    """
+    lengths = np.diff(observed_s, axis=1)[:, 0]
+    takes = np.array([reversal.takes_s for reversal in reversals] or [_TAKES_S])
+    seen_s = np.maximum(lengths - takes[:, None], lengths * _LEAST_SEEN).sum(axis=1)
+    return len(takes) / float((1 / seen_s).sum()) if len(lengths) else 0.0
+
+
+def _legs(samples: PathSamples, course: FloatArray, row: int, position_sd_m: float) -> tuple[int, int] | None:
+    """First row of the way before the turn and last row of the way after it, if the track goes back on it, farther
+    than errors explain."""
     start, end = _turn_rows(samples.track, course, row)
     if abs(course[end] - course[start]) > _CIRCLE_RAD:
-        return False
+        return None
     start, end = _straight(samples.track, course, start, -1), _straight(samples.track, course, end, 1)
     leg = max(_LEG_M, int(np.ceil(_LEG_SIGMAS * position_sd_m)))
     first, last = np.searchsorted(samples.track, samples.track[row] + np.arange(2)) - np.arange(2)
     if start - leg < first or end + leg > last:
-        return False
-    return all(
+        return None
+    back = all(
         _opposite(samples.xy_m, max(start - away, first + leg), min(end + away, last - leg), leg)
         for away in (0, _ARM_M)
     )
+    return (start - leg, end + leg) if back else None
 
 
 def _opposite(xy_m: FloatArray, start: int, end: int, leg: int) -> bool:
