@@ -337,16 +337,23 @@ def test_of_two_boxes_of_one_vehicle_the_better_is_kept() -> None:
         assert kept.score.tolist() == [0.9, 0.4]
 
 
+def plan_with(detector: Path, root: Path, threshold: float) -> Plan:
+    """The plan of a finished run with another detector."""
+    made = plan_of_finished(open_run(root))
+    inputs = made.job.inputs.model_copy(update={"labels": None, "detector": str(detector)})
+    config = made.config.model_copy(
+        update={"detection": made.config.detection.model_copy(update={"threshold": threshold})}
+    )
+    return Plan(Job(root=str(root), inputs=inputs, config=config), made.info, made.indices, made.inputs, made.keys)
+
+
 def test_a_run_detects_with_it_on_raw_frames(
     whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = tmp_path / "run"
     shutil.copytree(whole[0], root)
     path = tiny_yolo(tmp_path / "m.onnx", "oriented_boxes")
-    made = plan_of_finished(open_run(root))
-    inputs = made.job.inputs.model_copy(update={"labels": None, "detector": str(path)})
-    config = made.config.model_copy(update={"detection": made.config.detection.model_copy(update={"threshold": 0.75})})
-    plan = Plan(Job(root=str(root), inputs=inputs, config=config), made.info, made.indices, made.inputs, made.keys)
+    plan = plan_with(path, root, 0.75)
     monkeypatch.setattr("velfield.detection.onnx.detector.device_limitations", lambda device: [f"no GPU: {device}"])
     outcome = make_detector(plan)
     assert outcome.counts["threshold"] == 0.25
@@ -368,12 +375,7 @@ def test_a_model_that_finds_nothing_is_told_what_to_check(
     whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tiny_yolo(tmp_path / "m.onnx", "oriented_boxes")
-    made = plan_of_finished(open_run(whole[0]))
-    inputs = made.job.inputs.model_copy(update={"labels": None, "detector": str(path)})
-    config = made.config.model_copy(
-        update={"detection": made.config.detection.model_copy(update={"threshold": 0.99999})}
-    )
-    plan = Plan(Job(root=str(whole[0]), inputs=inputs, config=config), made.info, made.indices, made.inputs, made.keys)
+    plan = plan_with(path, whole[0], 0.99999)
     monkeypatch.setattr("velfield.pipeline.stages.detector._scale_of_gsd", lambda _: None)
     with pytest.raises(InputError, match=r"^the detector found no vehicle in \d+ frames, expected some, as the scale "):
         make_detector(plan)
