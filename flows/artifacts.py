@@ -2,6 +2,7 @@
 long stages."""
 
 import base64
+import hashlib
 import os
 import re
 import shlex
@@ -71,8 +72,10 @@ def _key(what: str) -> str:
     """Key of an artifact of this run: under one key Prefect keeps versions of one thing, and lists the last.
 
     Keys are of lower-case letters, digits and dashes; a run's name of other letters alone is in the description only.
+    The run folder's digest tells runs apart whose folders have one name.
     """
-    return re.sub(r"[^a-z0-9]+", "-", f"{flow_run.name} {what}".lower()).strip("-")
+    folder = hashlib.sha256(str(flow_run.parameters["run_folder"]).encode()).hexdigest()[:6]
+    return re.sub(r"[^a-z0-9]+", "-", f"{flow_run.name} {folder} {what}".lower()).strip("-")
 
 
 def _of(what: str) -> str:

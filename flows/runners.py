@@ -202,9 +202,9 @@ class ClientRunner(Runner):
                     return future.result(timeout=_WAIT_S)
                 except KilledWorker as error:
                     raise WorkersKilledError(
-                        f"{error.allowed_failures + 1} workers of {self._address} ended while they computed it, the "
-                        f"last at {error.last_worker.address}: their memory limit is too small for it, or something "
-                        "kills them"
+                        f"{count_text(error.allowed_failures + 1, 'worker')} of {self._address} ended while computing "
+                        f"it, the last at {error.last_worker.address}: the memory limit is too small for it, or "
+                        "something kills them"
                     ) from None
                 except TimeoutError:
                     if future.done():  # the graph's own error, or it ended as the wait did
@@ -254,7 +254,7 @@ def _count_tasks(dask_scheduler: Any) -> int:
 def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.warn) -> Iterator[Runner]:
     """A runner for the duration of a flow; a cluster that it started is shut down afterwards.
 
-    ``warn`` is called, once a minute at most, while a cluster has no workers.
+    ``warn`` is called when a worker ends that had work, and once a minute at most while a cluster has no workers.
     """
     if config == RunnerConfig():
         runner = ThreadsRunner(usable_processors())
@@ -273,6 +273,7 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
             warnings.simplefilter("ignore", VersionMismatchWarning)  # a table of several lines: `_check_workers`
             client = Client(cluster, timeout="60s", set_as_default=False)
         with client:
+            client.subscribe_topic("all", lambda event: _say_lost_worker(event, warn))
             if config.cluster_class is not None:
                 _wait_for_worker(client, warn)
             _check_workers(client, warn)
@@ -281,6 +282,15 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
                 _load_stages(client)
             asked = 0 if config.scheduler is not None else config.workers or 0
             yield ClientRunner(client, warn, cluster=cluster, asked=asked, own_workers=own)
+
+
+def _say_lost_worker(event: tuple[float, Any], warn: Callable[[str], None]) -> None:
+    """Say of an event of the scheduler that a worker ended with work: Dask computes that elsewhere without a word."""
+    found = event[1]
+    if not isinstance(found, dict) or found.get("action") != "remove-worker" or found["expected"]:
+        return
+    if found["processing-tasks"] or found["lost-computed-tasks"]:
+        warn(f"worker {found['worker']} ended, or was lost: its work is computed again on another")
 
 
 def _load_stages(client: Any) -> None:

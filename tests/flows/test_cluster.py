@@ -151,7 +151,11 @@ def one_that_kills_its_worker(plan: object, frames: range) -> object:
 
 
 def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: tuple[Path, RunSummary],
+    flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     root = before_detection(whole[0], tmp_path / "run")
     asked = {"cluster_class": "distributed.LocalCluster", "workers": 2}
@@ -163,6 +167,8 @@ def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
     assert (root / "killed").exists()
     (root / "killed").unlink()
     assert summary.complete
+    said = "".join(capsys.readouterr())
+    assert said.count("ended, or was lost: its work is computed again on another") == 1, said
     assert digests(root) == digests(whole[0])
 
 
@@ -194,8 +200,8 @@ def test_a_unit_over_the_memory_limit_is_tried_once_more_and_then_left_out_with_
     assert not summary.complete
     (why,) = next(stage.failures for stage in summary.stages if stage.name == "detections")
     assert "detections of frames 8 to 15 (" in why
-    assert "failed: 1 workers of tcp://" in why
-    assert "their memory limit is too small" in why
+    assert "failed: 1 worker of tcp://" in why
+    assert "the memory limit is too small" in why
     monkeypatch.undo()
     (root / "attempts").unlink()
     assert process(job(flight, root)).complete

@@ -1,11 +1,13 @@
 """Flows on threads of this process, and as Prefect shows them: the same results, retries and errors."""
 
 import logging
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -188,3 +190,17 @@ def test_prefect_is_not_imported_where_nothing_may_name_a_server(
     code += "print(type(o.choose_orchestration()).__name__, 'prefect' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert done.stdout.split() == ["Threads", "False"]
+
+
+def test_artifacts_of_runs_whose_folders_have_one_name_are_not_versions_of_one(
+    server: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from flows import artifacts
+
+    keys = []
+    for folder in ("/a/Run 1", "/b/Run 1", "/b/Run 1"):
+        flow_run = SimpleNamespace(name="Run 1", parameters={"run_folder": folder})
+        monkeypatch.setattr(artifacts, "flow_run", flow_run)
+        keys.append(artifacts._key("summary"))
+    assert keys[0] != keys[1] == keys[2]
+    assert all(re.fullmatch("run-1-[0-9a-f]{6}-summary", key) for key in keys)

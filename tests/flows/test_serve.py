@@ -504,10 +504,8 @@ def test_the_ui_shows_graph_retry_and_artifacts(
         page.wait("document.body.innerText.includes('the disk blinked')")
         page.wait("/Run Count\\s+2/.test(document.body.innerText)")
         assert "Retry 1/1 will start" in page.value("document.body.innerText")
-        (summary,) = served.ask(
-            "/artifacts/filter",
-            {"flow_runs": {"id": {"any_": [run["id"]]}}, "artifacts": {"key": {"any_": ["blinks-summary"]}}},
-        )
+        made = served.ask("/artifacts/filter", {"flow_runs": {"id": {"any_": [run["id"]]}}})
+        (summary,) = [one for one in made if re.fullmatch(r"blinks-[0-9a-f]{6}-summary", one["key"])]
         page.open(f"{served.url}/artifacts/artifact/{summary['id']}")
         page.wait("document.querySelectorAll('img[src^=data]').length == 2")
         page.wait("[...document.querySelectorAll('img')].every(img => img.naturalWidth > 100)")
