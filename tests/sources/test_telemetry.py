@@ -14,7 +14,7 @@ from tests.media import drifting, write_video
 from velfield.errors import Failure, InputError
 from velfield.sources.frames import SourceInfo
 from velfield.sources.source import probe
-from velfield.sources.telemetry.find import find_beside
+from velfield.sources.telemetry.find import find_beside, note_unusable
 from velfield.sources.telemetry.image_tags import parse_xmp
 from velfield.sources.telemetry.placement import (
     FramePoses,
@@ -85,8 +85,10 @@ def test_subtitles_that_are_no_telemetry_are_none(tmp_path: Path) -> None:
         read_telemetry_file(tmp_path / "x.srt", VIDEO)
     (tmp_path / "x.mp4").touch()
     assert find_beside(tmp_path / "x.mp4") is None
+    assert note_unusable(tmp_path / "x.mp4").startswith("x.srt, next to the video, holds no position")
     (tmp_path / "x.SRT").write_text(f"1\n00:00:01,000 --> 00:00:02,000\n{FORMATS['Mavic Mini'][0]}\n")
     assert find_beside(tmp_path / "x.mp4") == tmp_path / "x.SRT"
+    assert note_unusable(tmp_path / "x.mp4") == ""
 
 
 def test_zero_coordinates_are_no_place() -> None:

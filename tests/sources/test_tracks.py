@@ -15,6 +15,7 @@ from tests.track_files import (
     Variant,
     ambiguous,
     csv_text,
+    degrees,
     geotrax,
     ind,
     parquet_bytes,
@@ -247,3 +248,33 @@ def test_two_hundred_tables_by_rule_are_right_or_not_without_a_word(tmp_path: Pa
         assert np.corrcoef(np.sin(xy[:, 0] / 50), xy[:, 1])[0, 1] > 0.98, name  # y down
         right += 1
     assert 120 < right < 180
+
+
+@pytest.mark.parametrize(
+    ("names", "north_deg"),
+    [(("utm_x", "utm_y"), 90.0), (("easting", "northing"), 90.0), (("lon", "lat"), 88.73), (("x_m", "y_m"), None)],
+)
+def test_north_is_known_of_degrees_and_of_coordinates_to_the_east_and_north(
+    tmp_path: Path, names: tuple[str, str], north_deg: float | None
+) -> None:
+    """In the UTM zone of 15 degrees true north is 1.27 degrees to the right of the grid's at 13.4 degrees east."""
+    t = vehicles()
+    x, y = degrees(t) if names[0] == "lon" else (t["east"] + 400000, t["north"] + 5800000)
+    table = pd.DataFrame({"track_id": t["id"], "time_s": t["t"], names[0]: x, names[1]: y})
+    table.to_csv(tmp_path / "tracks.csv", index=False)
+    found = load(tmp_path / "tracks.csv", {}).north_rad
+    assert (found is None) == (north_deg is None)
+    if found is not None and north_deg is not None:
+        assert -np.degrees(found) == pytest.approx(north_deg, abs=0.1)
+
+
+def test_columns_without_a_number_or_a_length_are_named(tmp_path: Path) -> None:
+    t = vehicles()
+    table = pd.DataFrame({"track_id": t["id"], "time_s": t["t"], "utm_x": t["east"], "utm_y": t["north"]})
+    table.assign(length_m=-4.5).to_csv(tmp_path / "short.csv", index=False)
+    found = load(tmp_path / "short.csv", {})
+    assert "length_m holds no length of 0.3 to 40 m: it is left out" in found.notes
+    assert "length_m" not in found.table
+    table.assign(utm_x=np.nan).to_csv(tmp_path / "empty.csv", index=False)
+    with pytest.raises(InputError, match="found no number in columns utm_x and utm_y"):
+        load(tmp_path / "empty.csv", {})

@@ -120,7 +120,7 @@ def _read(file: Path) -> Tree:
     tree = _yaml(read_text(file, "configuration"), str(file)) or {}
     if not isinstance(tree, dict):
         raise InputError(
-            f"{file}: found a {type(tree).__name__}; expected sections with keys, as `velfield init VIDEO` writes them"
+            f"--config {file}: found no keys; expected sections with keys, as `velfield init VIDEO` writes them"
         )
     # A section all of whose keys are commented out, as `velfield init` writes it, is null.
     return {key: value for key, value in tree.items() if value is not None or not section_models(key)}

@@ -147,9 +147,9 @@ def analyse_tracks(
     )
     sizes_m = given.sizes_m(tracks.track_id)
     classes = find_classes(sizes_m, np.where(np.isfinite(sizes_m), SIZE_SD_M, np.nan)) if len(tracks) else None
-    georeference = Georeference(given.shape, given.crs_wkt, given.affine, given.gsd_m)
+    georeference = Georeference(given.shape, given.crs_wkt, given.affine, given.gsd_m, given.north_rad)
     yield from write_analysis(
-        TrafficAnalysis(tracks, slice_s, classes=classes, arm_names=ArmNames(given=arms or {})),
+        TrafficAnalysis(tracks, slice_s, classes=classes, arm_names=ArmNames(given.north_rad, arms or {})),
         to_path(out),
         georeference,
         about=path.name,

@@ -12,7 +12,7 @@ from schemas.flight import FlightConfig
 from velfield.analysis.speed_changes import PLAUSIBLE_M_PER_S2, check_times
 from velfield.analysis.trajectories import make_trajectories
 from velfield.errors import InputError
-from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd
+from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd, true_north_rad
 from velfield.sources.tracks.checks import check_speeds, check_standing_gaps, require_motion, split_reused
 from velfield.sources.tracks.read import GivenPositions, read_tracks
 from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
@@ -45,6 +45,9 @@ class LoadedTracks:
     crs_wkt, affine
         Reference system of the grid and (column, row) of pixel corners to its coordinates: a UTM zone where the file
         has degrees, else that of the base image; None without one.
+    north_rad
+        Direction of north on the grid, from x towards y (down): of true north by the reference system, else of the grid
+        of the file's map, up to some 3 degrees from it; None: not known.
     position_sd_m, displacement_sd_m
         Standard deviations of a smoothed position, and of a displacement from one position to the next, along one axis.
     notes
@@ -57,6 +60,7 @@ class LoadedTracks:
     base: BaseRaster | None
     crs_wkt: str | None
     affine: tuple[float, float, float, float, float, float] | None
+    north_rad: float | None
     position_sd_m: float
     displacement_sd_m: float
     notes: tuple[str, ...]
@@ -124,7 +128,10 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
         crs_wkt, affine = given.crs_wkt, (gsd_m, 0.0, east, 0.0, -gsd_m, north)
     notes += [*_place(given, corner, gsd_m), *(() if raster is None else raster.notes), *clean.notes]
     errors = (clean.position_sd_m, displacement_sd_m)
-    return LoadedTracks(table, shape, gsd_m, raster, crs_wkt, affine, *errors, tuple(notes))
+    north_rad = -np.pi / 2 if given.y_is_north else None
+    if crs_wkt is not None and affine is not None:
+        north_rad = true_north_rad(crs_wkt, affine, shape, name=path.name)
+    return LoadedTracks(table, shape, gsd_m, raster, crs_wkt, affine, north_rad, *errors, tuple(notes))
 
 
 def _check_accelerations(table: pd.DataFrame, xy_m: FloatArray, gsd_m: float) -> list[str]:

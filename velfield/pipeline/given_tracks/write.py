@@ -163,6 +163,7 @@ def _write_base(layout: RunLayout, given: LoadedTracks, positions: pd.DataFrame)
         gsd_m=given.gsd_m,
         crs_wkt=given.crs_wkt,
         affine=given.affine,
+        north_rad=None if given.crs_wkt else given.north_rad,
         base_source="given",
         registered_to="given",
         reference_frame=0,

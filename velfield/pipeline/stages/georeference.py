@@ -34,6 +34,7 @@ from velfield.sources.capture_times import read_flight_start
 from velfield.sources.clips import read_clips_telemetry
 from velfield.sources.geo import reconcile_gsd
 from velfield.sources.scale import choose_scale
+from velfield.sources.telemetry.find import note_unusable
 from velfield.sources.telemetry.placement import (
     FramePoses,
     North,
@@ -99,7 +100,9 @@ def compare_sources(
     estimates += [scale] if isinstance(scale, ScaleEstimate) else []
     described = poses.reason if isinstance(poses, Failure) else poses.telemetry.origin
     record = GeoreferenceRecord(scale=choose_scale(estimates), telemetry=described, start=_start(plan))
-    notes = [] if isinstance(poses, Failure) else _missing(scale, poses)
+    unusable = note_unusable(Path(plan.job.inputs.source)) if plan.job.inputs.telemetry is None else ""
+    notes = [unusable] if unusable else []
+    notes += [] if isinstance(poses, Failure) else _missing(scale, poses)
     if points is not None:
         record = with_control_points(record, points)
     if isinstance(poses, FramePoses):

@@ -14,11 +14,23 @@ _HEAD_BYTES = 100_000
 
 def find_beside(source: Path) -> Path | None:
     """The subtitles or KLV beside a video, of its name up to the suffix; None where there are none with telemetry."""
+    return next((path for path in _beside(source) if _holds_telemetry(path)), None)
+
+
+def note_unusable(source: Path) -> str:
+    """Note on a file of subtitles or KLV beside a video that holds no telemetry; empty where another one does, or
+    where there is none."""
+    beside = _beside(source)
+    if not beside or any(map(_holds_telemetry, beside)):
+        return ""
+    return f"{beside[0].name}, next to the video, holds no position, height or attitude: it is not used"
+
+
+def _beside(source: Path) -> list[Path]:
     if not source.is_file():
-        return None
+        return []
     name = re.sub(r"([*?\[])", r"[\1]", source.stem)
-    beside = sorted(path for path in source.parent.glob(f"{name}.*") if path.suffix.lower() in TELEMETRY_SUFFIXES)
-    return next((path for path in beside if _holds_telemetry(path)), None)
+    return sorted(path for path in source.parent.glob(f"{name}.*") if path.suffix.lower() in TELEMETRY_SUFFIXES)
 
 
 def _holds_telemetry(path: Path) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 from velfield.errors import Failure, InputError
 from velfield.sources.folder import list_images
 from velfield.sources.frames import SourceInfo, local_path
+from velfield.sources.telemetry.find import note_unusable
 from velfield.sources.telemetry.flight_log import is_flight_log, parse_flight_log
 from velfield.sources.telemetry.image_tags import read_image_telemetry
 from velfield.sources.telemetry.klv import KLV_KEY, KLV_SUFFIX, NEEDS_KLV, parse_klv
@@ -96,7 +97,9 @@ def _from_video(path: Path) -> Telemetry | Failure:
         unread = [what for stream in container.streams if (what := _unread_format(stream))]
         texts = [stream for stream in container.streams.subtitles if _is_text(stream)]
         klv = [stream for stream in container.streams.data if _has_format(stream, _KLV_NAMES)]
-        found: Telemetry | Failure = Failure("the video has no subtitles, and there is no .SRT file next to it")
+        found: Telemetry | Failure = Failure(
+            note_unusable(path) or "the video has no subtitles, and there is no .SRT file next to it"
+        )
         if texts:
             found = telemetry_from_cues(_embedded_cues(container, texts[0]), f"the subtitles of {path.name}")
         elif klv:

@@ -23,6 +23,11 @@ class Position:
     unit: Unit | None
     y_axis: YAxis | None
 
+    @property
+    def y_is_north(self) -> bool:
+        """Whether the names say that y is to the north of a map's grid: UTM, east, easting."""
+        return self.unit != "px" and ("utm" in self.x or "east" in self.x)
+
 
 @dataclass(frozen=True)
 class Speed:

@@ -52,6 +52,7 @@ class GivenPositions:
     unit : unit of ``x`` and ``y``: ``m`` or ``px``.
     y_axis : where y points in the file.
     crs_wkt : reference system of ``x`` and ``-y``: a UTM zone where the file has degrees; None: none.
+    y_is_north : whether ``-y`` is to the north of a map's grid whose reference system is not known.
     speed : speeds of the rows by the file.
     notes : notes on what was read and noticed, one line each.
     """
@@ -60,6 +61,7 @@ class GivenPositions:
     unit: str
     y_axis: YAxis
     crs_wkt: str | None
+    y_is_north: bool
     speed: GivenSpeed | None
     notes: tuple[str, ...]
 
@@ -156,7 +158,8 @@ class _Reader:
         what = f"{self.path.name}: {named}; {names} in {unit}, y {axis}{of}; times: {times_note}; "
         what += f"{table['track_id'].nunique()} vehicles"
         kind = "px" if unit == "px" else "m"
-        return GivenPositions(table, kind, axis, crs_wkt, speed, (what, *notes, *more))
+        north = position.y_is_north and axis == "up"
+        return GivenPositions(table, kind, axis, crs_wkt, north, speed, (what, *notes, *more))
 
     def _find(self, names: Sequence[str]) -> str | None:
         return next((self.columns[name] for name in names if name in self.columns), None)
@@ -169,8 +172,11 @@ class _Reader:
 
     def _position(self) -> Position:
         listed = POSITIONS if self.form is None else self.form.positions
-        there = [p for p in listed if p.x in self.columns and p.y in self.columns]
-        there = [p for p in there if not (self.raw[[self.columns[p.x], self.columns[p.y]]].isna().any(axis=1).all())]
+        named = [p for p in listed if p.x in self.columns and p.y in self.columns]
+        there = [p for p in named if not (self.raw[[self.columns[p.x], self.columns[p.y]]].isna().any(axis=1).all())]
+        if named and not there:
+            names = " and ".join(self.columns[name] for name in (named[0].x, named[0].y))
+            raise InputError(f"{self.path}: found no number in columns {names}, expected positions; fill them")
         if not there:
             raise self._missing("x and y")
         asked = [p for p in there if p.unit in (None, self.unit)] if self.unit else there
@@ -349,6 +355,9 @@ class _Reader:
                 values = pd.to_numeric(self.raw[self.columns[column]], errors="coerce").to_numpy(np.float64) * found[2]
                 sizes[name] = np.where((values > _SIZES_M[0]) & (values < _SIZES_M[1]), values, np.nan)
         known = sizes["length_m"][np.isfinite(sizes["length_m"])]
+        if not len(known):
+            span = f"{_SIZES_M[0]:g} to {_SIZES_M[1]:g} m"
+            return {}, [f"{self.columns[found[0]]} holds no length of {span}: it is left out"]
         if len(known) and self.form is None and float(np.median(known)) > 9.0 and found[0] != "lengthm":
             return {}, [f"{self.columns[found[0]]} is {np.median(known):.3g} for most: in feet? It is left out"]
         return sizes, []
