@@ -281,6 +281,7 @@ def serve_folder(config: ServeConfig) -> None:
     os.environ.update(settings(config))
     # Late, where the interrupt was lost: it may be raised where Python can only print it, as while it frees an object.
     stop_on_signals(resumes=False, grace_s=3 * _STOP_S)
+    print("the Prefect server starts, within a minute", file=sys.stderr, flush=True)
     try:
         with server(config):
             from flows.stale import mark_abandoned

@@ -113,7 +113,7 @@ export class AnalysisPanel {
     const metres = analysis.gsd_known ? "" : " The scale is not known: lengths assume 0.23 m per pixel.";
     const seen = analysis.seen ?? countText(analysis.tracks, "vehicle");
     const about = `${seen}. Grey: ${Math.round(100 * analysis.level)} % interval and n, the number of observations.${metres}`;
-    const named = `J0 on the map is junction 0. Roads are named by where they lead to (${analysis.directions}).`;
+    const named = `J0 on the map is junction 0, or crossing 0, in the text. Roads are named by where they lead to (${analysis.directions}).`;
     const names = analysis.names?.length ? [make("p", { class: "note" }, named)] : [];
     const note = make("p", { class: "note" }, table.note);
     const answers = (analysis.answers ?? []).flatMap(({ question, lines }) => [make("dt", {}, question), ...lines.map((line) => make("dd", {}, line))]);

@@ -282,6 +282,11 @@ def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
     tracks += [drive(SOUTH, 4.0 * k + 5.7) for k in range(12)]
     analysis = TrafficAnalysis(gather(tracks))
     assert [r.left for r in analysis.reversals] == [True]
+    (answer,) = (a for a in find_answers(analysis) if a.topic == "u-turns")
+    assert answer.text.endswith(": 1 at crossing 0")
+    alone = TrafficAnalysis(gather([*(drive(EAST, 4.0 * k) for k in range(12)), u_turn]))
+    (answer,) = (a for a in find_answers(alone) if a.topic == "u-turns")
+    assert answer.text.endswith(": 1 on lane 0, away from junctions")
     # half a circle of 7 m radius and 8 m of each leg, at 12 m/s, with what smoothing adds
     assert analysis.reversals[0].takes_s == pytest.approx((np.pi * 7 + 16) / 12, abs=1.0)
     assert "wrong way" in {u.kind for u in analysis.unusual}

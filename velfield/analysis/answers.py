@@ -23,7 +23,7 @@ _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
 DELAY_OF_PART = " or more"
 """Said after a delay of vehicles that come into view when they wait already."""
-_AT_JUNCTION_M, _ROAD_M = 20.0, 50.0
+_AT_JUNCTION_M, _ON_LANE_M, _ROAD_M = 20.0, 10.0, 50.0
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
 
@@ -284,10 +284,14 @@ def _places(found: Sequence[str]) -> str:
 
 
 def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
-    """The place of an event: the junction near it, if one is."""
+    """The place of an event: the junction near it, if one is; else the lane."""
     away = [(float(np.hypot(*(j.hull_m - xy_m).T).min()), j.number) for j in analysis.lanes.junctions]
     distance_m, number = min(away, default=(np.inf, 0))
-    return f"at {_place(analysis, number)}" if distance_m < _AT_JUNCTION_M else "away from junctions"
+    if distance_m < _AT_JUNCTION_M:
+        return f"at {_place(analysis, number)}"
+    aside = [(float(np.hypot(*(lane.xy_m - xy_m).T).min()), lane.number) for lane in analysis.lanes]
+    distance_m, lane = min(aside, default=(np.inf, 0))
+    return f"on lane {lane}, away from junctions" if distance_m < _ON_LANE_M else "away from junctions"
 
 
 def _unusual(analysis: TrafficAnalysis) -> Answer:

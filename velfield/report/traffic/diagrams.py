@@ -313,6 +313,8 @@ def _flow_caption(analysis: TrafficAnalysis) -> str:
     begin, end = analysis.window_s
     part = (end - begin) % _SLICE_S
     out = "By the arm that they enter from, in whole minutes."
+    if _SLICE_S - part < 0.5:
+        return out
     if part >= _LEAST_PART_S:
         return f"{out} The last {part:.0f} s are a part of one: their vehicles count as so many a minute."
     return f"{out} The last {part:.0f} s are too short a part of one, and left out." if part >= 0.5 else out
