@@ -36,7 +36,7 @@ FrameSize = Annotated[str, Parameter(help="Frame size, WxH in pixels.")]
 Seed = Annotated[int, Parameter(help="Seed of the city and the flight.")]
 Port = Annotated[int | None, Parameter(help="Port to listen on. Default: any free port.")]
 OpenBrowser = Annotated[bool, Parameter(name="--open", help="Open the browser, if there is a screen.")]
-Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=(), help="Print warnings only.")]
+Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=(), help="Print results and warnings only.")]
 Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative=())]
 LogJson = Annotated[bool, Parameter(name="--log-json", negative=())]
 
