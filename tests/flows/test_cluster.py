@@ -121,7 +121,8 @@ def test_workers_that_the_cluster_gave_up_are_replaced(
     elsewhere = {"threads_per_worker": 1, "n_workers": 0, "dashboard_address": "127.0.0.1:0"}
     config = RunnerConfig(workers=1, cluster_class=cluster_class, cluster_kwargs=elsewhere if cluster_class else {})
     soon = {"distributed.deploy.lost-worker-timeout": "300ms", "distributed.scheduler.allowed-failures": 0}
-    with dask.config.set(soon), open_runner(config) as runner:
+    said: list[str] = []
+    with dask.config.set(soon), open_runner(config, said.append) as runner:
         before = runner.call(os.getpid)
         if cluster_class is None:
             runner.restart_workers()
@@ -129,6 +130,7 @@ def test_workers_that_the_cluster_gave_up_are_replaced(
             with pytest.raises(WorkersKilledError):
                 runner.call(os.kill, before, 9)
         assert runner.call(os.getpid) not in (before, os.getpid())
+    assert len(said) == (cluster_class is not None)  # one that is restarted has not ended on its own
 
 
 def before_detection(whole: Path, root: Path) -> Path:
