@@ -93,6 +93,16 @@ def test_a_turn_of_three_vehicles_is_a_lane_whatever_its_radius_and_their_errors
     assert len(graph_of([driven(path) for path in [*crossing, *[turn] * 2]], sd_m=sd_m)) == 2
 
 
+def test_a_junction_reaches_to_where_its_lanes_have_parted() -> None:
+    exits = np.array([[0.0, 46.5], [60.0, 46.5], [75.0, 45.0], [150.0, 20.0]])
+    graph = graph_of([driven(path) for path in [AVENUE - [0.0, 3.5]] * 8 + [exits] * 5])
+    (junction,) = graph.junctions
+    assert junction.kind == "diverge"
+    out = [gate.xy_m for gate in find_gates(graph, junction).gates if not gate.inwards]
+    assert len(out) == 2
+    assert np.hypot(*np.subtract(*out)) > 3.0
+
+
 def test_lanes_of_one_direction_are_neighbours(avenue: LaneGraph) -> None:
     lane = max((lane for lane in avenue if lane.width_source == "neighbour"), key=lambda lane: lane.length_m)
     assert lane.width_m == pytest.approx(3.5, abs=0.35)

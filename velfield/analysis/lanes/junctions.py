@@ -17,6 +17,9 @@ _NEAR_M = 15.0
 _MARGIN_M, _HALF_LANE_M = 4.0, 2.0
 """Margin of a junction's area around its meeting points; and to the side of a lane's centre line in it, as vehicles
 beside the centre line pass it, too."""
+_PARTED_M, _PARTING_M = 3.5, 25.0
+"""Where lanes part the junction reaches to where they lie so far apart: nearer, a vehicle's place does not tell on
+which of them it is. It reaches no farther than this."""
 _CROSSING_RAD = np.radians(25)
 """Lanes whose directions differ less do not cross: they merge or run beside each other."""
 _MAX_RING_M = 220.0
@@ -37,6 +40,8 @@ def find_junctions(lanes: Sequence[Lane], connections: Sequence[Connection]) -> 
     groups.sort(key=lambda group: (group[0][:, 1].mean(), group[0][:, 0].mean()))
     made: list[Junction] = []
     for xy, kind in groups:
+        if kind in ("merge", "diverge"):
+            xy = np.concatenate([xy, _parted(xy, lanes, connections)])
         hull = _with_whole_lanes(buffered_hull(xy, _MARGIN_M), lanes)
         lanes_in, lanes_out, inside_ = _members(lanes, hull)
         made.append(
@@ -51,6 +56,25 @@ def find_junctions(lanes: Sequence[Lane], connections: Sequence[Connection]) -> 
             )
         )
     return tuple(made)
+
+
+def _parted(xy_m: FloatArray, lanes: Sequence[Lane], connections: Sequence[Connection]) -> FloatArray:
+    """Points (n, 2) of the lanes that part, or join, at one of the points (k, 2), to where they lie apart."""
+    out = [np.empty((0, 2))]
+    for along in (1, -1):
+        beside: dict[int, list[FloatArray]] = {}
+        for link in connections:
+            at, to = (link.start, link.end)[::along]
+            beside.setdefault(at, []).append(lanes[to].xy_m[::along])
+        for at, lines in beside.items():
+            place = lanes[at].xy_m[-1 if along == 1 else 0]
+            if len(lines) > 1 and np.hypot(*(xy_m - place).T).min() < 1e-6:
+                for line in lines:
+                    near = line[np.hypot(*(line - place).T) < _PARTING_M]
+                    others = np.concatenate([other for other in lines if other is not line])
+                    apart = np.asarray(cKDTree(others).query(near)[0]) > _PARTED_M
+                    out.append(near[: int(np.argmax(apart))] if apart.any() else near[:0])
+    return np.concatenate(out)
 
 
 def _with_whole_lanes(hull_m: FloatArray, lanes: Sequence[Lane]) -> FloatArray:
