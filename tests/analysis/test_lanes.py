@@ -93,6 +93,15 @@ def test_a_turn_of_three_vehicles_is_a_lane_whatever_its_radius_and_their_errors
     assert len(graph_of([driven(path) for path in [*crossing, *[turn] * 2]], sd_m=sd_m)) == 2
 
 
+@pytest.mark.parametrize("radius_m", [5.0, 8.0, 12.0])
+def test_a_turn_of_two_vehicles_does_not_cut_the_lane_of_few_that_they_leave(radius_m: float) -> None:
+    paths = [AVENUE] * 2 + [right_turn(radius_m)] * 2 + [AVENUE + np.array([80.0, 0.0])] + [STREET] * 4
+    graph = graph_of([driven(path) for path in paths])
+    assert len(graph) == 2
+    assert sorted(lane.tracks for lane in graph) == [5, 6]
+    assert min(lane.length_m for lane in graph) > 140
+
+
 def test_a_junction_reaches_to_where_its_lanes_have_parted() -> None:
     exits = np.array([[0.0, 46.5], [60.0, 46.5], [75.0, 45.0], [150.0, 20.0]])
     graph = graph_of([driven(path) for path in [AVENUE - [0.0, 3.5]] * 8 + [exits] * 5])

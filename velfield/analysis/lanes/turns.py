@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.lanes.graph import count_once
 from velfield.analysis.lanes.ridges import NODE_SPACING_M, Nodes
 from velfield.analysis.trajectories import PathSamples
@@ -32,11 +32,12 @@ _SAME_PLACE_NODES = 8
 @dataclass(frozen=True)
 class _Passes:
     """Tracks that go from one way to another: rows ``first`` to ``last`` of their samples, and the ``turn`` (n,) that
-    each takes, -1: one that too few take."""
+    each takes; whether enough take each turn, ``often`` (turns,)."""
 
     first: IntArray
     last: IntArray
     turn: IntArray
+    often: Mask
 
     @property
     def rows(self) -> tuple[IntArray, IntArray, FloatArray]:
@@ -64,15 +65,15 @@ def add_turns(
     passes = _find_passes(nodes, node, samples, chains, min_tracks)
     rows, of, share = passes.rows
     ways = np.concatenate([np.empty(0, np.int64), *(chain for chain in chains if _is_way(nodes, chain))])
-    taken = passes.turn >= 0
-    total_m = np.bincount(passes.turn[taken], (passes.last - passes.first)[taken])
-    mean_m = total_m / np.maximum(np.bincount(passes.turn[taken]), 1)
+    n = len(passes.often)
+    total_m = np.bincount(passes.turn, passes.last - passes.first, n)
+    mean_m = total_m / np.maximum(np.bincount(passes.turn, minlength=n), 1)
     parts = np.maximum(np.rint(mean_m / NODE_SPACING_M), 1).astype(np.int64)
     begin = len(nodes) + np.r_[0, np.cumsum(parts)].astype(np.int64)
     turn = passes.turn[of]
-    new = np.where(turn >= 0, begin[turn] + (share * np.r_[parts, 0][turn]).astype(np.int64), -1)
-    out = _take_over(node, rows, new, ways, int(begin[-1]))
-    rows, new = rows[turn >= 0], new[turn >= 0]
+    new = begin[turn] + (share * parts[turn]).astype(np.int64)
+    often = passes.often[turn]
+    out = _take_over(node, rows[often], new[often], ways, int(begin[-1]))
     out[rows] = new
     xy, direction = _nodes_at(samples, rows, new - len(nodes), int(parts.sum()))
     made = replace(
@@ -120,9 +121,8 @@ def _find_passes(
     angle = pd.Series(turned[order]).groupby(group).median().to_numpy(np.float64)
     is_turn = ((angle >= _TURN_RAD[0]) & (angle <= _TURN_RAD[1]))[group]
     often = count_once(samples.track[first], group, n) >= min_tracks
-    often &= np.bincount(group[is_turn], minlength=n) > 0
-    turn = np.where(often, np.cumsum(often) - 1, -1)[group]
-    return _Passes(first[is_turn], last[is_turn], turn[is_turn])
+    turns, turn = np.unique(group[is_turn], return_inverse=True)
+    return _Passes(first[is_turn], last[is_turn], turn, often[turns])
 
 
 def _between(a_rad: FloatArray, b_rad: FloatArray) -> FloatArray:
@@ -140,15 +140,15 @@ def _nodes_at(samples: PathSamples, rows: IntArray, number: IntArray, n: int) ->
 
 
 def _take_over(node: IntArray, rows: IntArray, new: IntArray, ways: IntArray, n: int) -> IntArray:
-    """The node (k,) of each sample after those of a ridge between the ways are the turn's that most of them take: of
-    ``n`` with those of the turns, -1: too few take it."""
+    """The node (k,) of each sample, after those of a ridge between the ways, which most of its samples' vehicles take
+    to turn, became the turn's: of ``n`` with those of the turns."""
     old = node[rows]
     between = (old >= 0) & ~np.isin(old, ways)
-    pairs, count = np.unique(old[between] * np.int64(n + 1) + new[between] + 1, return_counts=True)
+    pairs, count = np.unique(old[between] * np.int64(n) + new[between], return_counts=True)
     order = np.argsort(-count, kind="stable")
-    owner, best = np.unique(pairs[order] // (n + 1), return_index=True)
+    owner, best = np.unique(pairs[order] // n, return_index=True)
     total, used = np.bincount(node[node >= 0], minlength=n), np.bincount(old[between], minlength=n)
     mostly = 2 * used[owner] > total[owner]
     to = np.arange(-1, n)
-    to[owner[mostly] + 1] = pairs[order][best][mostly] % (n + 1) - 1
+    to[owner[mostly] + 1] = pairs[order][best][mostly] % n
     return np.asarray(to[node + 1])
