@@ -67,11 +67,13 @@ def test_a_quantile_beyond_which_no_value_need_lie_is_withheld() -> None:
     assert estimate_quantile(values, 0.85, np.arange(19.0)) is None  # 19 that pass within 19 s
 
 
-def test_the_rate_of_events_holds_the_true_one() -> None:
+@pytest.mark.parametrize("bunched", [1.001, 1.15, 1.2])
+def test_the_rate_of_events_holds_the_true_one_though_they_come_in_bunches(bunched: float) -> None:
     rng = np.random.default_rng(3)
-    true = rng.uniform(2.0, 20.0, 2000)
-    found = [estimate_event_rate(int(n), 0.5) for n in rng.poisson(0.5 * true)]
-    assert 0.88 <= np.mean([e.low <= t <= e.high for e, t in zip(found, true, strict=True)]) <= 0.93
+    true = rng.uniform(4.0, 20.0, 4000)
+    counts = rng.negative_binomial(0.5 * true / (bunched - 1), 1 / bunched)
+    found = [estimate_event_rate(int(n), 0.5) for n in counts]
+    assert 0.87 <= np.mean([e.low <= t <= e.high for e, t in zip(found, true, strict=True)]) <= 0.93
     assert estimate_event_rate(0, 0.5).high == pytest.approx(4.6, abs=0.01)
 
 

@@ -17,6 +17,8 @@ from velfield.compiled import kernel
 
 LEVEL = 0.9
 _LEAST_EXPOSURE_H = 59 / 3600
+_BUNCHED = 1.15
+"""Variance over mean of the number of U-turns in 300 s, of 150 simulated clips: of few events it cannot be measured."""
 MIN_VEHICLES = 5
 """Fewer vehicles give no estimate."""
 _MAX_SKEW = 0.8
@@ -270,18 +272,19 @@ def estimate_rate(counts: IntArray | FloatArray, exposure: float) -> Estimate | 
 
 
 def estimate_event_rate(events: int, hours: float) -> Estimate:
-    """Events an hour of few that come by chance, the interval by Poisson's law; of none from 0 to the rate that is not
-    exceeded.
+    """Events an hour of few that come by chance, the interval by Poisson's law, a little wider as they come in bunches;
+    of none from 0 to the rate that is not exceeded.
 
     Examples
     --------
     >>> rate = estimate_event_rate(3, 0.1)
     >>> round(rate.value), round(rate.low), round(rate.high)
-    (30, 11, 70)
+    (30, 10, 73)
     """
     if events == 0:
         return Estimate(0.0, 0.0, float(-np.log(1 - LEVEL)) / hours, 0)
-    low, high = (float(special.gammaincinv(events + 0.5, p)) / hours for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    shape = (events + 0.5) / _BUNCHED
+    low, high = (float(special.gammaincinv(shape, p)) * _BUNCHED / hours for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     return Estimate(events / hours, low, high, events)
 
 
