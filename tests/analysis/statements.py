@@ -175,13 +175,14 @@ def queue_pairs(signal: JunctionSignal, truth: Truth) -> Iterator[tuple[Estimate
 def _u_turns(analysis: TrafficAnalysis, numbers: IntArray, whole: set[int], begun: set[int]) -> Iterator[Statement]:
     for reversal in analysis.reversals:
         yield Statement("u-turn", int(numbers[reversal.track]) in begun, f"at {reversal.xy_m.round()}")
-    hourly = len(whole) / analysis.trajectories.duration_s * 3600
+    # one seen over less than 20 m before or after may count, and need not
+    least, most = (len(found) / analysis.trajectories.duration_s * 3600 for found in (whole, begun))
     for answer in find_answers(analysis):
         if answer.topic == "u-turns":
             # each is a statement above; the answer says how many an hour there are, or that this is not known
             low, high = (answer.estimate.low, answer.estimate.high) if answer.estimate else (0.0, answer.at_most_per_h)
-            text = f"{answer.text}; {len(whole)} in truth"
-            yield Statement("u-turns", high is None or low <= hourly <= high, text, high is None)
+            text = f"{answer.text}; {len(whole)} to {len(begun)} in truth"
+            yield Statement("u-turns", high is None or (low <= most and least <= high), text, high is None)
 
 
 def u_turns_found(analysis: TrafficAnalysis, truth: Truth, whole: set[int]) -> tuple[int, int]:
