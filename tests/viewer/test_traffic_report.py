@@ -147,6 +147,18 @@ def test_delay_of_an_approach_is_the_mean_over_its_vehicles(
     assert sorted(name.split(",")[0] for name in lane_names(found).values()) == ["from N", "from W"]
 
 
+def test_the_caption_of_delays_says_of_queues_out_of_view_only_where_one_is(
+    analysis: TrafficAnalysis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def caption() -> str:
+        (delay,) = [one for one in traffic_diagrams(analysis, None) if one.name.startswith("delay")]
+        return delay.caption
+
+    assert "Or worse" not in caption()
+    monkeypatch.setattr(TrafficAnalysis, "delay_is_partial", lambda *_: True)
+    assert "Or worse: the queue ends out of view." in caption()
+
+
 def test_speeds_are_in_the_unit_of_choice_everywhere(analysis: TrafficAnalysis) -> None:
     """43 km/h are 27 mph: the nearest sign is one of 25 mph where signs are in mph."""
     page = first_page(analysis, unit="mph")

@@ -80,13 +80,14 @@ def traffic_diagrams(
         delays = approach_delays(analysis, found)
         if delays:
             unknown = arms_without_delay(found, delays)
+            beyond = " Or worse: the queue ends out of view." if any("or worse" in d.level for d in delays) else ""
             yield Diagram(
                 f"delay-{found.junction.number}",
                 f"Junction {found.junction.number}: delay and level of service by approach",
                 "Mean delay against vehicles that pass freely, in view, up to 150 m before the junction, of those that "
-                "were seen for 60 m; black lines: its 90 % interval. Or worse: the queue ends out of view. Level of "
-                "service by the Highway Capacity Manual, 7th edition (A: best, F: worst), between the dashed lines."
-                + (f" Too few were seen to know it from {list_text(unknown)}." if unknown else ""),
+                f"were seen for 60 m; black lines: its 90 % interval.{beyond} Level of service by the Highway Capacity "
+                "Manual, 7th edition (A: best, F: worst), between the dashed lines."
+                + (f" From {list_text(unknown)} too few were seen so far, or went freely." if unknown else ""),
                 partial(draw_delays, delays=delays),
                 1.5 + 0.4 * len(delays),
             )
