@@ -95,17 +95,16 @@ def _first_plan(plan: Plan) -> Plan:
         write_atomically(detector, shipped_detector().to_json().encode())
         inputs = {"detector": str(detector), "labels": None}
         record = InputsRecord.model_validate(record.model_dump() | {"detector": "shipped", "labels": None})
-    first = replace(_with_root(plan, **inputs), indices=plan.indices[:FIRST_FRAMES], inputs=record)
-    lens = {"frames": min(plan.config.lens.frames, _LENS_FRAMES), "refine": "never"}
-    base = {"median_frames": min(plan.config.base.median_frames, _MEDIAN_FRAMES)}
-    config = first.config.model_copy(
-        update={
-            "lens": first.config.lens.model_copy(update=lens),
-            "base": first.config.base.model_copy(update=base),
-        }
-    )
-    first = replace(first, job=first.job.model_copy(update={"config": config}))
-    return replace(first, keys=stage_keys(first.config, record)).with_lost_units(["all other frames"])
+    first = _with_root(plan, **inputs)
+    lens, base = first.config.lens, first.config.base
+    few = {
+        "lens": lens.model_copy(update={"frames": min(lens.frames, _LENS_FRAMES), "refine": "never"}),
+        "base": base.model_copy(update={"median_frames": min(base.median_frames, _MEDIAN_FRAMES)}),
+    }
+    job = first.job.model_copy(update={"config": first.config.model_copy(update=few)})
+    keys = stage_keys(job.config, record)
+    first = replace(first, job=job, indices=plan.indices[:FIRST_FRAMES], inputs=record, keys=keys)
+    return first.with_lost_units(["all other frames"])
 
 
 def _make(plan: Plan, stages: Sequence[str], compute: Compute) -> None:

@@ -62,9 +62,9 @@ def add_turns(
     min_tracks
         Fewest tracks of a turn.
     """
-    passes = _find_passes(nodes, node, samples, chains, min_tracks)
+    ways = [chain for chain in chains if np.hypot(*np.diff(nodes.xy_m[chain], axis=0).T).sum() >= _WAY_M]
+    passes = _find_passes(nodes, node, samples, ways, min_tracks)
     rows, of, share = passes.rows
-    ways = np.concatenate([np.empty(0, np.int64), *(chain for chain in chains if _is_way(nodes, chain))])
     n = len(passes.often)
     total_m = np.bincount(passes.turn, passes.last - passes.first, n)
     mean_m = total_m / np.maximum(np.bincount(passes.turn, minlength=n), 1)
@@ -85,18 +85,10 @@ def add_turns(
     return made, out
 
 
-def _is_way(nodes: Nodes, chain: IntArray) -> bool:
-    return float(np.hypot(*np.diff(nodes.xy_m[chain], axis=0).T).sum()) >= _WAY_M
-
-
-def _find_passes(
-    nodes: Nodes, node: IntArray, samples: PathSamples, chains: list[IntArray], min_tracks: int
-) -> _Passes:
+def _find_passes(nodes: Nodes, node: IntArray, samples: PathSamples, ways: list[IntArray], min_tracks: int) -> _Passes:
     way_of, position = np.full(len(nodes) + 1, -1), np.zeros(len(nodes), np.int64)
-    for number, chain in enumerate(chains):
-        position[chain] = np.arange(len(chain))
-        if _is_way(nodes, chain):
-            way_of[chain] = number
+    for number, chain in enumerate(ways):
+        way_of[chain], position[chain] = number, np.arange(len(chain))
     rows = np.flatnonzero(way_of[node] >= 0)
     way, track = way_of[node[rows]], samples.track[rows]
     # a sample off the way ends the drive on it: the vehicle may waver between the way and the turn
@@ -111,7 +103,7 @@ def _find_passes(
     )
     goes = (track[a] == track[b]) & (way[a] != way[b]) & (rows[b] - rows[a] <= _TURN_MAX)
     a, b, turned = a[goes], b[goes], turned[goes]
-    pair, place = way[a] * np.int64(len(chains)) + way[b], position[node[rows[a]]]
+    pair, place = way[a] * np.int64(len(ways)) + way[b], position[node[rows[a]]]
     order = np.lexsort((place, pair))
     pair, place = pair[order], place[order]
     apart = (pair[1:] != pair[:-1]) | (place[1:] - place[:-1] > _SAME_PLACE_NODES)
@@ -139,11 +131,11 @@ def _nodes_at(samples: PathSamples, rows: IntArray, number: IntArray, n: int) ->
     return np.column_stack([x, y]) / count[:, None], np.arctan2(sin, cos)
 
 
-def _take_over(node: IntArray, rows: IntArray, new: IntArray, ways: IntArray, n: int) -> IntArray:
+def _take_over(node: IntArray, rows: IntArray, new: IntArray, ways: list[IntArray], n: int) -> IntArray:
     """The node (k,) of each sample, after those of a ridge between the ways, which most of its samples' vehicles take
     to turn, became the turn's: of ``n`` with those of the turns."""
     old = node[rows]
-    between = (old >= 0) & ~np.isin(old, ways)
+    between = (old >= 0) & ~np.isin(old, np.concatenate(ways) if ways else [])
     pairs, count = np.unique(old[between] * np.int64(n) + new[between], return_counts=True)
     order = np.argsort(-count, kind="stable")
     owner, best = np.unique(pairs[order] // n, return_index=True)
