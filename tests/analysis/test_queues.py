@@ -75,8 +75,8 @@ def test_a_queue_that_ends_where_the_view_begins_is_a_lower_bound(stream: Stream
     assert cut.delay_is_partial(junction, "N")
     assert not cut.delay_is_partial(junction, "W")
     said = {answer.subject: answer.text for answer in find_answers(cut) if answer.topic == "queue"}
-    assert said[f"junction {junction} from N"].startswith("longest when green begins at least 4 vehicles")
-    assert said[f"junction {junction} from W"].startswith("longest when green begins 4 vehicles")
+    assert "straight on to S (lane 2): at least 4 vehicles" in said[f"junction {junction} from N"]
+    assert "straight on to E and right to S (lane 0): 4 vehicles" in said[f"junction {junction} from W"]
 
 
 def test_where_some_are_hidden_others_may_be_behind_the_last() -> None:

@@ -93,13 +93,37 @@ def test_turning_counts_and_shares(analysis: TrafficAnalysis) -> None:
     assert share is not None
     assert share.value == pytest.approx(0.2)
     assert share.low < 0.2 < share.high
-    # 60 m and the junction at 12 m/s are some 6 s; nobody comes from the north without a stop, to compare with
+    # 60 m and the junction at 12 m/s are some 6 s
     delay, travel = found["W", "E"].delay_s, found["W", "E"].travel_time_s
     assert delay is not None
     assert travel is not None
     assert travel.value - delay.value == pytest.approx(6.0, abs=0.7)
-    assert found["N", "S"].travel_time_s is not None
-    assert found["N", "S"].delay_s is None
+
+
+def test_where_all_stop_the_delay_is_against_the_pace_at_which_they_come(analysis: TrafficAnalysis) -> None:
+    """Every vehicle from the north waits: none shows how long the way through takes freely."""
+    south = [(t, xy) for t, xy in crossroads() if np.ptp(xy[:, 0]) < 1.0]
+    lost_s = [times[-1] - times[0] - 220.0 / SPEED for times, _ in south]
+    (found,) = (j for j in analysis.movements if j.junction.kind == "intersection")
+    delay = found.delays_s["N"]
+    assert delay.n == len(south) == 48
+    assert delay.value == pytest.approx(np.mean(lost_s), abs=1.0)
+    assert found.timed("N") == 48
+    near = [(t[xy[:, 1] >= 35.0], xy[xy[:, 1] >= 35.0]) for t, xy in crossroads()]  # they come into view to stop
+    (cut,) = TrafficAnalysis(gather(near)).movements
+    assert "N" not in cut.delays_s
+    assert "W" in cut.delays_s
+
+
+def test_vehicles_too_few_for_a_delay_of_each_turn_give_that_of_their_approach() -> None:
+    tracks = [drive(EAST, 20.0 * k, stop_at_m=130.0, go_s=20.0 * k + 25.0) for k in range(8)]
+    tracks += [drive(RIGHT, 20.0 * k + 9.0, stop_at_m=130.0, go_s=20.0 * k + 30.0) for k in range(8)]
+    tracks += [drive(SOUTH, 11.0 * k + 1.5) for k in range(12)]
+    (found,) = (j for j in TrafficAnalysis(gather(tracks)).movements if j.junction.kind == "intersection")
+    assert {m.delay_s for m in found.movements if m.arm_in == "W"} == {None}
+    lost_s = [times[-1] - times[0] - 260.0 / SPEED for times, _ in tracks[:8]]  # those who turn lose about as much
+    assert found.delays_s["W"].n == 16
+    assert found.delays_s["W"].value == pytest.approx(np.mean(lost_s), rel=0.3)
 
 
 def test_a_few_starts_that_recur_show_a_signal_but_not_at_a_roundabout(analysis: TrafficAnalysis) -> None:

@@ -112,6 +112,8 @@ class Clip:
                     ("movement: travel time", "travel_time_s"), ("movement: delay", "delay_s"),
                 ):  # fmt: skip
                     yield from _pair(kind, getattr(m, name), getattr(other, name))
+            for arm, delay in found.delays_s.items():
+                yield from _pair("approach: delay", delay, real.delays_s.get(arm))
 
     def _lanes(self) -> Iterator[Interval]:
         analysis, long = self.analysis, self.long_run.on(self.analysis.lanes)

@@ -26,27 +26,38 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
     assert len(answers) == 5
     assert "cycle 40.0 s" in answers["Is there a signal, and is it fair?"]
     assert re.search(
-        r"from W \(lane \d+\): green and yellow for \d+ s, .*, 60 vehicles crossed",
+        r"from W, straight on and right \(lane \d+\): green and yellow for \d+ s, .*, 60 vehicles crossed",
         answers["Is there a signal, and is it fair?"],
     )
-    assert re.search(
-        r"junction \d from W: .*; longest queue of a lane when green begins 4 vehicles", " ".join(answers.values())
+    waits = dict(page.answers)["Which approach waits longest, and how long are the queues?"]
+    assert re.fullmatch(
+        r"junction 0: the longest queue when green begins is from W, straight on to E and right to S \(lane \d\): "
+        "4 vehicles, 26 m; the longest from N may be as long",
+        waits[0],
     )
+    assert waits[1] == "junction 0: vehicles from N wait longest"
+    assert [line.split(";")[0] for line in waits[2:]] == ["from N: 48 vehicles", "from W: 60 vehicles"]
+    assert answers["Where do vehicles go?"].startswith("junction 0: 108 of the 108 vehicles were seen to enter it, ")
+    assert answers["Where is it dangerous?"].startswith("nothing dangerous was seen in 8.5 min: ")
+    assert "up to 16 such near misses an hour" in answers["Where is it dangerous?"]
     assert any(line.startswith("classes") for line in page.withheld)
     assert page.sections[-1][0].startswith("What is not known")
 
 
-def test_which_approach_waits_longest_is_not_said_where_a_delay_is_not_known(analysis: TrafficAnalysis) -> None:
-    """None comes from the north without a stop, to compare with: from the west vehicles wait less, or longer."""
-    (found,) = analysis.movements
-    assert arms_without_delay(found, approach_delays(analysis, found)) == ["N"]
-    answers = dict(first_page(analysis).answers)
-    waits = answers["Which approach waits longest, and how long are the queues?"]
-    assert waits[0].startswith("junction 0: which approach waits longest is not known, as the delay from N is not")
-    assert answers["Is there a signal, and is it fair?"][-1] == (
+def test_which_approach_waits_longest_is_not_said_where_a_delay_is_not_known() -> None:
+    """From the north all come into view when they brake: from the west vehicles wait less, or longer."""
+    near = TrafficAnalysis(gather([(t[xy[:, 1] >= 35.0], xy[xy[:, 1] >= 35.0]) for t, xy in crossroads()]))
+    (found,) = near.movements
+    assert arms_without_delay(found, approach_delays(near, found)) == ["N"]
+    page = first_page(near)
+    answers = dict(page.answers)
+    assert answers["Which approach waits longest, and how long are the queues?"][1] == (
+        "junction 0: which approach waits longest is not known, as the delay from N is not"
+    )
+    assert answers["Is there a signal, and is it fair?"][1] == (
         "junction 0: whether it is fair is not known: the delay from N is not"
     )
-    assert sum(line.startswith("delay: ") for line in first_page(analysis).withheld) == 1
+    assert sum(line.startswith("delay: junction 0 from N: too little data") for line in page.withheld) == 1
 
 
 def test_vehicles_on_lanes_without_a_junction_are_counted(analysis: TrafficAnalysis) -> None:
@@ -134,9 +145,9 @@ def test_delay_of_an_approach_is_the_mean_over_its_vehicles(
     found = next(m for m in analysis.movements if m.junction.kind == "intersection")
     number = found.junction.number
     delays = {d.arm: d for d in approach_delays(analysis, found)}
-    mine = [m for m in found.movements if m.arm_in == "W" and m.delay_s]
-    total = sum((m.seen + m.inferred) * m.delay_s.value for m in mine if m.delay_s)
-    assert delays["W"].delay_s.value == pytest.approx(total / sum(m.seen + m.inferred for m in mine))
+    of_movements = [m.delay_s.value for m in found.movements if m.arm_in == "W" and m.delay_s]
+    assert len(of_movements) == 2
+    assert min(of_movements) < delays["W"].delay_s.value < max(of_movements)
     assert set(delays["W"].level.split(" to ")) <= {"A", "B"}
     monkeypatch.setitem(analysis.signals, number, replace(analysis.signals[number], signalised=None))
     without_level = approach_delays(analysis, found)

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from schemas.analysis import Turn
 from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
 from schemas.flight import STATIONARY_SPEED_M_PER_S
@@ -23,6 +24,7 @@ _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
 DELAY_OF_PART = " or more"
 """Said after a delay of vehicles that come into view when they wait already."""
+_TURNS: dict[Turn, str] = {"straight": "straight on", "left": "left", "right": "right", "u-turn": "back"}
 _AT_JUNCTION_M, _ON_LANE_M, _ROAD_M = 20.0, 10.0, 50.0
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
@@ -78,8 +80,8 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
         else:
             yield _signal(analysis, signal)
     for found in analysis.movements:
-        for arm, queue in longest_queues(analysis, found).items():
-            text = f"longest when green begins {queue_text(queue)}"
+        for arm, (lane, queue) in longest_queues(analysis, found).items():
+            text = f"longest when green begins, {lane_text(found, lane)}: {queue_text(queue)}"
             yield Answer(
                 "queue", f"junction {found.junction.number} from {arm}", "found", text, queue.vehicles, "vehicles"
             )
@@ -230,33 +232,45 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
         lasts = green_duration_s(streams, cycle.value)
         long = f" and yellow for {lasts:.0f} s" if lasts else ""
         begins = streams[0].green_phase_s
-        after = "" if first_s is None else f", {(begins.value - first_s) % cycle.value:.0f} s after the first"
         first_s = begins.value if first_s is None else first_s
+        later_s = (begins.value - first_s) % cycle.value
+        after = f", from {later_s:.0f} s after the first began" if later_s else ""
         crossed = np.unique(np.concatenate([s.stream.cross_track for s in streams]))
         text += (
-            f"; {_from_arms(analysis, signal.junction, lanes)}green{long}{after}, seen to begin "
+            f"; {_from_arms(analysis, signal.junction, lanes)}green{long}{after}, seen "
             f"{count_text(begins.n, 'time')}, {count_text(len(crossed), 'vehicle')} crossed"
         )
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 
-def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, Queue]:
-    """The longest queue at a green of each arm of a junction whose signal is known, where vehicles queue."""
+def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, tuple[int, Queue]]:
+    """The longest queue at a green of each arm of a junction whose signal is known, where vehicles queue, and its
+    lane."""
     signal, arm = analysis.signals.get(found.junction.number), found.gates.arms_in
-    out: dict[str, Queue] = {}
+    out: dict[str, tuple[int, Queue]] = {}
     for stream in signal.streams if signal else ():
-        name = arm.get(stream.stream.approach.lane)
+        lane = stream.stream.approach.lane
+        name = arm.get(lane)
         for queue in queues(stream.stream, stream.green_s):
-            if name and queue.vehicles.value and (name not in out or queue.length_m > out[name].length_m):
-                out[name] = queue
+            if name and queue.vehicles.value and (name not in out or queue.length_m > out[name][1].length_m):
+                out[name] = lane, queue
     return out
 
 
+def lane_text(found: JunctionMovements, lane: int) -> str:
+    """A lane into a junction by the ways that its vehicles go: ``straight on to E and right to S (lane 0)``."""
+    ways = [f"{_TURNS[m.turn]} to {m.arm_out}" for m in found.movements_of(lane)]
+    return f"{list_text(ways)} (lane {lane})" if ways else f"on lane {lane}"
+
+
 def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -> str:
-    """Where the lanes of a phase come from."""
-    arms_in = next(found.gates for found in analysis.movements if found.junction.number == junction).arms_in
-    arms = sorted({arm for lane, arm in arms_in.items() if lane in lanes})
-    return f"from {' and '.join(arms)} ({lanes_text(lanes)}): " if arms else f"{lanes_text(lanes)}: "
+    """Where the lanes of a phase come from, and which turns their vehicles take."""
+    found = next(found for found in analysis.movements if found.junction.number == junction)
+    mine = {lane: arm for lane, arm in found.gates.arms_in.items() if lane in lanes}
+    turns = dict.fromkeys(_TURNS[m.turn] for lane in mine for m in found.movements_of(lane))
+    ways = f", {list_text([*turns])}" if turns else ""
+    arms = f"from {list_text(sorted(set(mine.values())))}{ways} " if mine else ""
+    return f"{arms}({lanes_text(lanes)}): " if arms else f"{lanes_text(lanes)}: "
 
 
 def _conflicts(analysis: TrafficAnalysis) -> Answer:
@@ -291,7 +305,11 @@ def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
         return f"at {_place(analysis, number)}"
     aside = [(float(np.hypot(*(lane.xy_m - xy_m).T).min()), lane.number) for lane in analysis.lanes]
     distance_m, lane = min(aside, default=(np.inf, 0))
-    return f"on lane {lane}, away from junctions" if distance_m < _ON_LANE_M else "away from junctions"
+    if distance_m >= _ON_LANE_M:
+        return "away from junctions"
+    arms = ((found, gate) for found in analysis.movements for gate in found.gates.gates if gate.lane == lane)
+    of = [f"{found.gates.arms[gate.arm].name} of junction {found.junction.number}" for found, gate in arms]
+    return f"on lane {lane}, on the road {of[0]}" if of else f"on lane {lane}, away from junctions"
 
 
 def _unusual(analysis: TrafficAnalysis) -> Answer:
@@ -320,8 +338,7 @@ def _events(topic: str, analysis: TrafficAnalysis, n: int, detail: str = "") -> 
         text = f"none was seen in {duration_text(seconds)}, too short a time to say how rare they are"
         return Answer(topic, "", "too little data", text)
     hourly = estimate_event_rate(0, hours).high
-    fewer = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
-    text = f"none in {duration_text(seconds)}, so fewer than {fewer} an hour with 90 % probability"
+    text = f"none in {duration_text(seconds)}, so fewer than {rate_text(hourly)} an hour with 90 % probability"
     return Answer(topic, "", "none", text, at_most_per_h=hourly)
 
 
@@ -353,9 +370,25 @@ def queue_text(queue: Queue) -> str:
     return f"{count_text(n.value, 'vehicle')}{ends}, {queue.length_m:.0f} m"
 
 
+def list_text(names: Sequence[str]) -> str:
+    """Names for people.
+
+    Examples
+    --------
+    >>> list_text(["N", "S", "W"])
+    'N, S and W'
+    """
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
 def duration_text(seconds: float) -> str:
     """A duration in seconds or minutes, for people."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"
+
+
+def rate_text(hourly: float) -> str:
+    """A rate an hour, for people."""
+    return f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
 
 
 def estimate_text(estimate: Estimate | None, unit: str, factor: float = 1.0) -> str:

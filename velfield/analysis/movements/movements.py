@@ -7,7 +7,7 @@ scaled until their rows add up to the entries that were lost, and their columns 
 method).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +29,7 @@ _PACED_M = 20.0
 _FURNESS_STEPS = 60
 _SLICE_S = 120.0
 """Counts of slices so long show how much the flow varies."""
-MIN_PASSES, _MIN_DELAYED, _MIN_FREE = 3, 10, 3
+MIN_PASSES, MIN_DELAYED, _MIN_FREE = 3, 10, 3
 """Fewest vehicles of a movement; of which the delay is known; and of these that do not stop."""
 _TURN_RAD = np.radians(40)
 """Who changes his direction by less goes straight on."""
@@ -51,7 +51,7 @@ class Passes:
 
     ``entry_s``, ``exit_s`` and ``upstream_s`` (``_UPSTREAM_M`` before the entry) are times, NaN where unknown;
     ``farther_m`` and ``farther_s``: how far before that the track is seen, up to ``_FARTHER_M`` and from the junction
-    before on, and for how long; ``farther_stood``: at some time there;
+    before on, and for how long; ``farther_stood``: at some time there; ``inside_m``: length of its way inside;
     ``joined``: of two tracks or more of one vehicle, of which ``track`` is the one that enters (or leaves);
     ``stood``: at some time between upstream and exit.
     """
@@ -67,6 +67,7 @@ class Passes:
     farther_m: FloatArray
     farther_s: FloatArray
     farther_stood: Mask
+    inside_m: FloatArray
 
     @property
     def travel_s(self) -> FloatArray:
@@ -112,12 +113,13 @@ class Movement:
 
 @dataclass(frozen=True)
 class JunctionMovements:
-    """All movements of a junction."""
+    """All movements of a junction; ``delays_s``: mean delay of those that enter by an arm, by its name."""
 
     junction: Junction
     gates: Gates
     passes: Passes
     movements: tuple[Movement, ...]
+    delays_s: Mapping[str, Estimate]
 
     @property
     def volume(self) -> float:
@@ -126,16 +128,34 @@ class JunctionMovements:
 
     def entered(self, arm_in: str) -> float:
         """Vehicles that entered by an arm, those that went ways too rare for a movement of their own among them."""
-        mine = [m for m in self.movements if m.arm_in == arm_in]
+        mine = self._from(arm_in)
         counted = sum(m.seen + m.inferred for m in mine)
         return max([counted, *((m.seen + m.inferred) / m.share.value for m in mine if m.share)])
 
     def tracks(self, movement: Movement) -> IntArray:
         """Numbers of the tracks of a movement's vehicles whose both ends are known: those that enter."""
+        return np.asarray(self.passes.track[self._took(movement)])
+
+    def timed(self, arm_in: str) -> int:
+        """Vehicles of an arm's movements that are seen from 60 m before the junction to its exit."""
+        timed = np.isfinite(self.passes.travel_s)
+        return sum(int(np.count_nonzero(self._took(m) & timed)) for m in self._from(arm_in))
+
+    def movements_of(self, lane: int) -> list[Movement]:
+        """Movements that vehicles of a lane into the junction take, that of most first."""
+        mine = np.array([gate.lane == lane for gate in self.gates.gates] + [False])[self.passes.gate_in]
+        count = {m.arm_out: int(np.count_nonzero(self._took(m) & mine)) for m in self._from(self.gates.arms_in[lane])}
+        taken = [m for m in self._from(self.gates.arms_in[lane]) if count[m.arm_out]]
+        return sorted(taken, key=lambda m: -count[m.arm_out])
+
+    def _from(self, arm_in: str) -> list[Movement]:
+        return [m for m in self.movements if m.arm_in == arm_in]
+
+    def _took(self, movement: Movement) -> Mask:
+        """(n,) passes of a movement whose both ends are known."""
         name = np.array([self.gates.arms[gate.arm].name for gate in self.gates.gates] + [""])
-        passes = self.passes
-        rows = (name[passes.gate_in] == movement.arm_in) & (name[passes.gate_out] == movement.arm_out)
-        return np.asarray(passes.track[rows])
+        ends = name[self.passes.gate_in], name[self.passes.gate_out]
+        return np.asarray((ends[0] == movement.arm_in) & (ends[1] == movement.arm_out))
 
 
 def find_movements(
@@ -169,8 +189,8 @@ def find_movements(
         gates = find_gates(graph, junction, names)
         passes = _passes(samples, rows, gates, waits_elsewhere)
         passes = _within(_by_track(passes, cut), *trajectories.window_s)
-        movements = tuple(_count(junction, gates, passes, slices, trajectories.observed_s))
-        out.append(JunctionMovements(junction, gates, passes, movements))
+        movements, delays_s = _count(junction, gates, passes, slices, trajectories.observed_s)
+        out.append(JunctionMovements(junction, gates, passes, movements, delays_s))
     return tuple(out)
 
 
@@ -191,7 +211,7 @@ def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits_elsewher
     if not len(inside):
         none, number = np.empty(0), np.empty(0, np.int64)
         no = np.empty(0, bool)
-        return Passes(number, number, number, none, none, none, no, no, none, none, no)
+        return Passes(number, number, number, none, none, none, no, no, none, none, no, none)
     breaks = np.flatnonzero((np.diff(inside) > 1) | (np.diff(samples.track[inside]) != 0)) + 1
     first, last = inside[np.r_[0, breaks]], inside[np.r_[breaks - 1, len(inside) - 1]]
     enters = (first > 0) & (samples.track[np.maximum(first - 1, 0)] == samples.track[first])
@@ -228,6 +248,7 @@ def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits_elsewher
         np.where(reaches, up - far, 0.0),
         np.where(reaches, samples.time_s[up] - samples.time_s[far], 0.0),
         waits[up] > waits[far],
+        (last - first).astype(np.float64),
     )
 
 
@@ -254,7 +275,8 @@ def _within(passes: Passes, begin_s: float, end_s: float) -> Passes:
 
 def _count(
     junction: Junction, gates: Gates, passes: Passes, slices: ObservedSlices, observed_s: FloatArray
-) -> Iterator[Movement]:
+) -> tuple[tuple[Movement, ...], dict[str, Estimate]]:
+    """The movements of a junction, and the delay of each arm, by its name, where it is known."""
     arm = np.array([gate.arm for gate in gates.gates] + [-1], np.int64)
     arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
     n = len(gates.arms)
@@ -268,27 +290,39 @@ def _count(
     inferred = joined + furness(known, lost, found)
     pairs = [(int(i), int(j)) for i, j in zip(*np.nonzero(known >= MIN_PASSES), strict=True)]
     spread = _spread([passes.travel_s[both & (arm_in == i) & (arm_out == j)] for i, j in pairs])
+    timed = both & np.isfinite(passes.travel_s)
+    pace = {i: _free_pace(passes.select(timed & (arm_in == i))) for i, _ in pairs}
+    of_arm: dict[str, list[_Times]] = {}
+    movements = []
     for i, j in pairs:
         rows = both & (arm_in == i) & (arm_out == j)
         total = seen[i, j] + inferred[i, j]
         entering = seen[i].sum() + inferred[i].sum()
         counts = slices.sums(passes.entry_s[rows]) * total / max(known[i, j], 1)
-        travel, delay = _travel_and_delay(passes.select(rows), observed_s, spread)
+        name_in, name_out = gates.arms[i].name, gates.arms[j].name
+        turn = _turn(gates.arms[i], gates.arms[j])
+        times = _times(passes.select(rows & timed), pace[i], turn, total / max(known[i, j], 1))
+        if times.lost_s is not None:
+            of_arm.setdefault(name_in, []).append(times)
         effective = round(float(known[i].sum()))
         share = estimate_share(total / entering * effective, effective)
-        yield Movement(
-            junction.number,
-            gates.arms[i].name,
-            gates.arms[j].name,
-            _turn(gates.arms[i], gates.arms[j]),
-            int(seen[i, j]),
-            float(inferred[i, j]),
-            share,
-            estimate_rate(counts, slices.hours),
-            travel,
-            delay,
-            np.array([gates.arms[i].xy_m, junction.centre_m, gates.arms[j].xy_m]),
+        movements.append(
+            Movement(
+                junction.number,
+                name_in,
+                name_out,
+                turn,
+                int(seen[i, j]),
+                float(inferred[i, j]),
+                share,
+                estimate_rate(counts, slices.hours),
+                _mean_time(times.travel_s, times.travel_s, times.begin_s, observed_s, spread, times.weight),
+                _delay([times], observed_s, spread),
+                np.array([gates.arms[i].xy_m, junction.centre_m, gates.arms[j].xy_m]),
+            )
         )
+    delays = {name: _delay(times, observed_s, spread) for name, times in of_arm.items()}
+    return tuple(movements), {name: delay for name, delay in delays.items() if delay}
 
 
 def furness(seen: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
@@ -321,37 +355,75 @@ def _spread(times_s: Sequence[FloatArray]) -> tuple[float, int]:
     return (float(np.sqrt(squares / degrees)), _SPREAD_N) if degrees else (0.0, 0)
 
 
-def _travel_and_delay(
-    passes: Passes, observed_s: FloatArray, spread: tuple[float, int]
-) -> tuple[Estimate | None, Estimate | None]:
-    """Travel time of a movement, and its delay against the fastest tenth of its vehicles that do not stop; no delay
-    where hardly any passes without a stop."""
-    known = passes.select(np.isfinite(passes.travel_s))
-    travel = _mean_time(known.travel_s, known, observed_s, spread)
-    free = known.select(~known.stood)
-    if travel is None or travel.n < _MIN_DELAYED or len(free.track) < _MIN_FREE:
-        return travel, None
-    goes = (known.farther_m >= _PACED_M) & ~known.farther_stood
-    longer = np.zeros(len(known.track))
-    if goes.sum() >= _MIN_FREE:
-        pace = float(np.quantile(known.farther_s[goes] / known.farther_m[goes], 0.1))
-        longer = np.maximum(known.farther_s - pace * known.farther_m, 0.0)
-    whole = _mean_time(known.travel_s + longer, known, observed_s, spread)
-    least = float(np.quantile(free.travel_s, 0.1))
-    assert whole is not None
-    return travel, Estimate(whole.value - least, max(whole.low - least, 0.0), whole.high - least, whole.n)
+@dataclass(frozen=True)
+class _Times:
+    """Times (n,) of the passes of a movement that are seen from upstream to their exit, s.
+
+    ``travel_s`` from ``begin_s`` on; ``whole_s``: what they need longer farther back than a free vehicle added;
+    ``lost_s``: what of that a free one does not need, None where that is not known. ``weight`` (n,): vehicles that each
+    stands for.
+    """
+
+    begin_s: FloatArray
+    travel_s: FloatArray
+    whole_s: FloatArray
+    lost_s: FloatArray | None
+    weight: FloatArray
+
+
+def _free_pace(passes: Passes) -> float | None:
+    """Time a metre of the fastest tenth of vehicles that come to a junction and do not stop on the way, farther away
+    than its delays begin."""
+    goes = (passes.farther_m >= _PACED_M) & ~passes.farther_stood
+    if goes.sum() < _MIN_FREE:
+        return None
+    return float(np.quantile(passes.farther_s[goes] / passes.farther_m[goes], 0.1))
+
+
+def _times(passes: Passes, pace: float | None, turn: Turn, weight: float) -> _Times:
+    """Times of a movement's passes: a free vehicle's is that of the fastest tenth of those that do not stop; where
+    hardly any passes without a stop, as where a queue never clears, that at the pace of those that come."""
+    whole = passes.travel_s
+    if pace is not None:
+        whole = whole + np.maximum(passes.farther_s - pace * passes.farther_m, 0.0)
+    free = ~passes.stood
+    least = None
+    if free.sum() >= _MIN_FREE:
+        least = float(np.quantile(passes.travel_s[free], 0.1))
+    elif pace is not None and len(whole):
+        inside = pace * float(np.median(passes.inside_m))
+        if turn != "straight":  # nobody turns at the pace of the road
+            inside = max(inside, float(np.quantile(passes.exit_s - passes.entry_s, 0.1)))
+        least = pace * _UPSTREAM_M + inside
+    lost = None if least is None else whole - least
+    return _Times(passes.upstream_s, passes.travel_s, whole, lost, np.full(len(whole), weight))
+
+
+def _delay(of: Sequence[_Times], observed_s: FloatArray, spread: tuple[float, int]) -> Estimate | None:
+    """Mean delay of the vehicles of some movements; None of fewer than ten whose delay is known."""
+    known = [(t.lost_s, t.whole_s, t.begin_s, t.weight) for t in of if t.lost_s is not None]
+    if sum(len(row[0]) for row in known) < MIN_DELAYED:
+        return None
+    lost, whole, begin, weight = map(np.concatenate, zip(*known, strict=True))
+    delay = _mean_time(lost, whole, begin, observed_s, spread, weight)
+    return replace(delay, low=max(delay.low, 0.0)) if delay else None
 
 
 def _mean_time(
-    time_s: FloatArray, passes: Passes, observed_s: FloatArray, spread: tuple[float, int]
+    value_s: FloatArray,
+    whole_s: FloatArray,
+    begin_s: FloatArray,
+    observed_s: FloatArray,
+    spread: tuple[float, int],
+    weight: FloatArray,
 ) -> Estimate | None:
-    """Mean time of passes: those that take long are more often cut by the begin and the end of what is seen, and weigh
-    more."""
+    """Mean of values (n,) of passes that begin at times and take so long: those that take long are more often cut by
+    the begin and the end of what is seen, and weigh more."""
     clip_s = np.diff(observed_s, axis=1)
-    weight = 1 / np.maximum(np.maximum(clip_s - time_s, 0.0).sum(axis=0) / clip_s.sum(), _LEAST_SEEN)
+    weight = weight / np.maximum(np.maximum(clip_s - whole_s, 0.0).sum(axis=0) / clip_s.sum(), _LEAST_SEEN)
     weight = weight / weight.mean() if len(weight) else weight
-    mean = float((weight * time_s).mean()) if len(time_s) else 0.0
-    return estimate_mean(mean + weight * (time_s - mean), passes.upstream_s, spread=spread)
+    mean = float((weight * value_s).mean()) if len(value_s) else 0.0
+    return estimate_mean(mean + weight * (value_s - mean), begin_s, spread=spread)
 
 
 def _turn(arm_in: Arm, arm_out: Arm) -> Turn:

@@ -7,7 +7,7 @@ from math import hypot, sqrt
 import numpy as np
 from scipy import stats
 
-from velfield.analysis.answers import DELAY_OF_PART
+from velfield.analysis.answers import DELAY_OF_PART, list_text
 from velfield.analysis.flow.volume import LOS_SIGNAL_S, LOS_YIELD_S, delay_level
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.movements.movements import JunctionMovements
@@ -37,20 +37,12 @@ class ApproachDelay:
 
 
 def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list[ApproachDelay]:
-    """Delay by arm, the mean over its movements weighted by their vehicles; the longest first."""
+    """Delay by arm, the longest first."""
     number = found.junction.number
     signalised = analysis.is_signalised(number)
     limits = {None: (), True: LOS_SIGNAL_S, False: LOS_YIELD_S}[signalised]
     out = []
-    for arm in dict.fromkeys(m.arm_in for m in found.movements):
-        known = [(m.delay_s, m.seen + m.inferred) for m in found.movements if m.arm_in == arm and m.delay_s]
-        if not known:
-            continue
-        weight = np.array([n for _, n in known]) / sum(n for _, n in known)
-        value, low, high = (np.array([getattr(one, end) for one, _ in known]) for end in ("value", "low", "high"))
-        mean = float(weight @ value)
-        # movements of an arm wait in the same queues: their errors do not cancel
-        delay = Estimate(mean, float(weight @ low), float(weight @ high), sum(one.n for one, _ in known))
+    for arm, delay in found.delays_s.items():
         partly = analysis.delay_is_partial(number, arm)
         out.append(ApproachDelay(arm, delay, delay_level(delay, signalised=signalised, partly=partly), limits, partly))
     return sorted(out, key=lambda one: -one.delay_s.value)
@@ -59,17 +51,6 @@ def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list
 def arms_without_delay(found: JunctionMovements, delays: Sequence[ApproachDelay]) -> list[str]:
     """Arms by which vehicles enter a junction, and whose delay is not known."""
     return sorted({m.arm_in for m in found.movements} - {d.arm for d in delays})
-
-
-def list_text(names: Sequence[str]) -> str:
-    """Names for people.
-
-    Examples
-    --------
-    >>> list_text(["N", "S", "W"])
-    'N, S and W'
-    """
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ()) -> str:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.export import PER_M_PER_S, SpeedUnit
+from velfield.analysis.answers import list_text
 from velfield.analysis.flow.conflicts import LIKELY
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.movements.movements import MIN_PASSES, JunctionMovements
@@ -17,7 +18,7 @@ from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import count_text
 from velfield.report.colours import TONES
-from velfield.report.traffic.approaches import ApproachDelay, approach_delays, arms_without_delay, lane_names, list_text
+from velfield.report.traffic.approaches import ApproachDelay, approach_delays, arms_without_delay, lane_names
 from velfield.report.traffic.place import draw_junctions_aside, draw_map, draw_place, place_caption, place_labels
 from velfield.report.traffic.turning import draw_turning, turning_height_in
 
@@ -59,7 +60,7 @@ def traffic_diagrams(
         "The place",
         place_caption(analysis, labels),
         partial(draw_place, analysis=analysis, picture=picture, labels=labels),
-        4.3,
+        4.0,
         bare=True,
     )
     junctions = sorted(

@@ -1,27 +1,31 @@
 """The first page: five questions with their answers, and what could not be said."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import find_answers, longest_queues, queue_text, seen_text
-from velfield.analysis.movements.movements import JunctionMovements
-from velfield.analysis.signals.cycles import Queue
+from velfield.analysis.answers import (
+    Answer,
+    duration_text,
+    find_answers,
+    lane_text,
+    list_text,
+    longest_queues,
+    queue_text,
+    rate_text,
+    seen_text,
+)
+from velfield.analysis.movements.movements import MIN_DELAYED, JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import count_text
-from velfield.report.traffic.approaches import (
-    ApproachDelay,
-    approach_delays,
-    arms_without_delay,
-    compare_delays,
-    list_text,
-)
+from velfield.report.traffic.approaches import ApproachDelay, approach_delays, arms_without_delay, compare_delays
 
-_PER_QUESTION = 4
-_NO_DELAY = "delay not known"
-_WHY_NO_DELAY = "too little data: 10 vehicles must be seen from 60 m before the junction on, and 3 pass without a stop"
+_PER_QUESTION, _LINES = 4, 8
+"""Most lines of an answer, and of one on junctions, which takes several on each."""
+_SAFE_PER_H = 3.0
+"""Where there may be more near misses an hour than this, none being seen says little."""
 _EVENTS = {
-    "conflicts": "conflicts",
+    "conflicts": "near misses",
     "u-turns": "U-turns",
     "unusual": "against the traffic, or by a way that others avoid",
 }
@@ -50,36 +54,36 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     delays = {found.junction.number: approach_delays(analysis, found) for found in analysis.movements}
     unknown = {m.junction.number: arms_without_delay(m, delays[m.junction.number]) for m in analysis.movements}
     fairness = {f"junction {number}": compare_delays(known, unknown[number]) for number, known in delays.items()}
-    for answer in find_answers(analysis, unit=unit):
+    answers = list(find_answers(analysis, unit=unit))
+    for answer in answers:
         place = f"{answer.subject}: " if answer.subject else ""
         text = place + answer.text
         if answer.state == "too little data":
             withheld.append(f"{answer.topic}: {text}")
             reasons.setdefault(answer.topic, []).append(place + answer.text.removeprefix("too little data: "))
+        elif answer.topic == "signal" and answer.estimate:
+            cycle, *phases = answer.text.split("; ")
+            fair = [place + fairness[answer.subject]] if fairness.get(answer.subject) else []
+            found.setdefault("signal", []).extend([f"{place}there is a signal: {cycle}", *fair, *phases])
         else:
             found.setdefault(answer.topic, []).append(text)
-            if answer.topic == "signal" and answer.estimate and fairness.get(answer.subject):
-                found["signal"].append(place + fairness[answer.subject])
 
     waits: list[str] = []
-    longest_waits: list[str] = []
     for found_at in _met(analysis):
-        number, longest = found_at.junction.number, longest_queues(analysis, found_at)
-        waits += _approaches(found_at, delays[number], longest)
-        if unknown[number] and (longest or delays[number]):
-            withheld.append(f"delay: junction {number} from {list_text(unknown[number])}: {_WHY_NO_DELAY}")
-            longest_waits.append(f"junction {number}: {_longest_wait(unknown[number], longest)}")
+        number = found_at.junction.number
+        waits += _waits(analysis, found_at, delays[number], unknown[number])
+        withheld += [f"delay: junction {number} from {arm}: {_why_no_delay(found_at, arm)}" for arm in unknown[number]]
 
     def why(topic: str, otherwise: str) -> str:
         return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
 
-    events = [f"{name}: {text}" for topic, name in _EVENTS.items() for text in found.get(topic, [])[:1]]
     no_junction = "no junction of lanes was found"
     no_signal = "no junction was found where lanes cross" if analysis.movements else no_junction
     questions = (
         (
             "Where do vehicles go?",
             [
+                *(_entered(analysis, found_at) for found_at in _met(analysis)[:_PER_QUESTION] if found_at.movements),
                 *_few(found.get("movement") or found.get("through", [])),
                 *found.get("merging", []),
                 *(_few(found.get("other lanes", [])) if "movement" in found or "through" not in found else []),
@@ -88,16 +92,20 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
         ),
         (
             "Which approach waits longest, and how long are the queues?",
-            [*_few(longest_waits), *_few(waits)],
+            waits[:_LINES],
             "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
         ),
-        ("Is there a signal, and is it fair?", _few(found.get("signal", [])), why("signal", no_signal)),
+        ("Is there a signal, and is it fair?", found.get("signal", [])[:_LINES], why("signal", no_signal)),
         (
             "How fast do vehicles drive?",
             _few(found.get("speed") or found.get("mean speed", [])),
             why("speed", "no lane was found"),
         ),
-        ("Where is it dangerous?", events, f"conflicts: {why('conflicts', 'no lane was found')}"),
+        (
+            "Where is it dangerous?",
+            [*_danger(answers, analysis.trajectories.duration_s)],
+            f"conflicts: {why('conflicts', 'no lane was found')}",
+        ),
     )
     return FirstPage(
         seen_text(analysis.trajectories),
@@ -117,26 +125,70 @@ def _met(analysis: TrafficAnalysis) -> list[JunctionMovements]:
     return sorted((m for m in analysis.movements if analysis.ways_meet(m.junction.number)), key=lambda m: -m.volume)
 
 
-def _longest_wait(unknown: list[str], longest: Mapping[str, Queue]) -> str:
-    """That it is not known which approach of a junction waits longest; and which has the longest queue, if one has."""
-    by_length = sorted(longest, key=lambda arm: -longest[arm].length_m)
-    text = f"which approach waits longest is not known, as the delay from {list_text(unknown)} is not"
-    sure = len(by_length) > 1 and longest[by_length[0]].vehicles.low > longest[by_length[1]].vehicles.high
-    return f"{text}; the longest queue is that from {by_length[0]}" if sure else text
+def _entered(analysis: TrafficAnalysis, found: JunctionMovements) -> str:
+    """How many of the vehicles enter a junction, and by which arms."""
+    by_arm = {m.arm_in: found.entered(m.arm_in) for m in found.movements}
+    arms = list_text([f"{n:.0f} from {arm}" for arm, n in sorted(by_arm.items(), key=lambda item: -item[1])])
+    of = count_text(len(analysis.trajectories), "vehicle")
+    return f"junction {found.junction.number}: {sum(by_arm.values()):.0f} of the {of} were seen to enter it, {arms}"
 
 
-def _approaches(found: JunctionMovements, known: list[ApproachDelay], longest: Mapping[str, Queue]) -> list[str]:
-    """A line on each approach of a junction with a known delay or queue: that which waits longest first, or that with
-    the longest queue where a delay is not known."""
-    delays = {delay.arm: delay for delay in known}
-    names = list(dict.fromkeys((*delays, *longest)))
-    if arms_without_delay(found, known):
-        names.sort(key=lambda name: -longest[name].length_m if name in longest else 0.0)
-    out = []
-    for name in names:
+def _waits(
+    analysis: TrafficAnalysis, found: JunctionMovements, delays: list[ApproachDelay], unknown: list[str]
+) -> Iterator[str]:
+    """The longest queue of a junction and who waits longest; then a line on each approach that has either."""
+    longest = longest_queues(analysis, found)
+    if not longest and not delays:
+        return
+    place = f"junction {found.junction.number}"
+    by_length = sorted(longest, key=lambda arm: -longest[arm][1].length_m)
+    if by_length:
+        lane, queue = longest[by_length[0]]
+        others = {arm: longest[arm][1] for arm in by_length[1:]}
+        also = [arm for arm, q in others.items() if q.reaches_edge or q.vehicles.high >= queue.vehicles.low]
+        alike = f"; the longest from {list_text(also)} may be as long" if also else ""
+        yield (
+            f"{place}: the longest queue when green begins is from {by_length[0]}, {lane_text(found, lane)}: "
+            f"{queue_text(queue)}{alike}"
+        )
+    if unknown:
+        yield f"{place}: which approach waits longest is not known, as the delay from {list_text(unknown)} is not"
+    elif len(delays) > 1:
+        most = [d.arm for d in delays if d.partly or d.delay_s.high >= delays[0].delay_s.low]
+        yield (
+            f"{place}: vehicles from {list_text(most)} wait longest"
+            if len(most) < len(delays)
+            else (f"{place}: no approach is shown to wait longest")
+        )
+    for name in dict.fromkeys((*(delay.arm for delay in delays), *by_length)):
         said = [count_text(found.entered(name), "vehicle")]
-        said.append(f"mean delay {delays[name].text}" if name in delays else _NO_DELAY)
+        said += [f"mean delay {delay.text}" for delay in delays if delay.arm == name] or ["delay not known"]
         if name in longest:
-            said.append(f"longest queue of a lane when green begins {queue_text(longest[name])}")
-        out.append(f"junction {found.junction.number} from {name}: " + "; ".join(said))
-    return out
+            said.append(f"longest queue {queue_text(longest[name][1])}")
+        yield f"from {name}: " + "; ".join(said)
+
+
+def _why_no_delay(found: JunctionMovements, arm: str) -> str:
+    timed = found.timed(arm)
+    if timed < MIN_DELAYED:
+        seen = f"{timed} were seen from 60 m before the junction to behind it"
+        return f"too little data: of the {MIN_DELAYED} vehicles that it takes {seen}"
+    return "too little data: 3 vehicles must come, or pass, without a stop"
+
+
+def _danger(answers: list[Answer], duration_s: float) -> Iterator[str]:
+    """The verdict where neither a near miss nor an unusual track was seen; else, and of U-turns, what was."""
+    events = {answer.topic: answer for answer in answers if answer.topic in _EVENTS}
+    seen = {topic: answer for topic, answer in events.items() if answer.state != "too little data"}
+    if all(topic in seen and seen[topic].at_most_per_h for topic in ("conflicts", "unusual")):
+        most = seen.pop("conflicts").at_most_per_h or 0.0
+        del seen["unusual"]
+        short = ", so that this does not show that the place is safe" if most > _SAFE_PER_H else ""
+        yield (
+            f"nothing dangerous was seen in {duration_text(duration_s)}: no two vehicles came within 1.5 s of meeting "
+            f"each other, and none drove against the traffic. There may still be up to {rate_text(most)} such near "
+            f"misses an hour{short}"
+        )
+    elif "conflicts" in events and seen and "conflicts" not in seen:
+        yield f"near misses: {events['conflicts'].text}"
+    yield from (f"{name}: {seen[topic].text}" for topic, name in _EVENTS.items() if topic in seen)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _INK = "#1b1f24"
 _PALE_BOX = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
-_LEAST_PT = (460.0, 255.0)
+_LEAST_PT = (460.0, 240.0)
 """Width and height that the map has at least, of the page of the PDF."""
 _MARGIN = 0.05
 """Margin around lanes without a picture, as a fraction of their extent."""
