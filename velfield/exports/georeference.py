@@ -17,26 +17,18 @@ MPS_TO_KMH = 3.6
 
 @dataclass(frozen=True)
 class Georeference:
-    """Reference system and scale of the base image.
-
-    Attributes
-    ----------
-    shape
-        (h, w) of the base image.
-    crs_wkt, affine
-        Reference system, and (column, row) of pixel corners to its coordinates; None without one.
-    gsd_m
-        Metres a base pixel; None if unknown.
-    north_rad
-        Direction of true north, from +x towards +y (down), where it is known without a reference system, as by a
-        drone's compass; else None.
-    """
+    """Reference system and scale of the base image."""
 
     shape: tuple[int, int]
+    """(h, w) of the base image."""
     crs_wkt: str | None = None
     affine: tuple[float, float, float, float, float, float] | None = None
+    """Reference system, and (column, row) of pixel corners to its coordinates; None without one."""
     gsd_m: float | None = None
+    """Metres a base pixel; None if unknown."""
     north_rad: float | None = None
+    """Direction of true north, from +x towards +y (down), where it is known without a reference system, as by a drone's
+    compass; else None."""
 
     @classmethod
     def from_grid(cls, grid: GridRecord) -> "Georeference":

@@ -28,21 +28,14 @@ MIN_COUNT = 5
 
 @dataclass(frozen=True)
 class Change:
-    """Change of one quantity, after minus before.
-
-    Attributes
-    ----------
-    change
-        (y, x); NaN where either field is empty.
-    p_value
-        (y, x) two-sided; NaN where ``change`` is.
-    significant
-        (y, x) bool, at the false discovery rate `FDR_LEVEL`.
-    """
+    """Change of one quantity, after minus before."""
 
     change: FloatArray
+    """(y, x); NaN where either field is empty."""
     p_value: FloatArray
+    """(y, x) two-sided; NaN where ``change`` is."""
     significant: Mask
+    """(y, x) bool, at the false discovery rate `FDR_LEVEL`."""
 
     def summary(self) -> tuple[int, int]:
         """Numbers of pixels compared and of significant ones."""

@@ -20,25 +20,17 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class VelocityGate:
-    """The velocity distribution at a position with a covariance, and its highest-density region.
-
-    Attributes
-    ----------
-    mean_px_per_s, covariance
-        (2,) and (2, 2), (px/s)^2, of the velocity: an initial state for a filter.
-    expected_log_density
-        Mean log density of the distribution: its negative differential entropy, nats.
-    min_density
-        Threshold on the density per (px/s)^2: the region above it has the probability mass ``coverage``.
-    coverage
-        In (0, 1).
-    """
+    """The velocity distribution at a position with a covariance, and its highest-density region."""
 
     mean_px_per_s: FloatArray
     covariance: FloatArray
+    """(2,) and (2, 2), (px/s)^2, of the velocity: an initial state for a filter."""
     expected_log_density: float
+    """Mean log density of the distribution: its negative differential entropy, nats."""
     min_density: float
+    """Threshold on the density per (px/s)^2: the region above it has the probability mass ``coverage``."""
     coverage: float
+    """In (0, 1)."""
     _densities: Callable[[FloatArray], FloatArray]
 
     def log_density(self, v: FloatArray) -> FloatArray:

@@ -42,17 +42,6 @@ class VelocityBins:
 
     The outermost bins also hold all higher speeds.
 
-    Attributes
-    ----------
-    width_px_per_s : float
-        Width of a bin, px/s.
-    reach : int
-        Bins on either side of the central one; an axis has ``2 * reach + 1``.
-    kernel_sigma_px_per_s : float
-        Standard deviation of the Gaussian kernel that a segment adds, px/s.
-    gsd_m : float or None
-        Metres a base pixel; None where speeds are known in px/s only.
-
     Examples
     --------
     >>> bins = VelocityBins(width_px_per_s=10.0, reach=2, kernel_sigma_px_per_s=3.5)
@@ -61,9 +50,13 @@ class VelocityBins:
     """
 
     width_px_per_s: float
+    """Width of a bin, px/s."""
     reach: int
+    """Bins on either side of the central one; an axis has ``2 * reach + 1``."""
     kernel_sigma_px_per_s: float
+    """Standard deviation of the Gaussian kernel that a segment adds, px/s."""
     gsd_m: float | None = None
+    """Metres a base pixel; None where speeds are known in px/s only."""
 
     def __post_init__(self) -> None:
         if not (self.width_px_per_s > 0 and self.kernel_sigma_px_per_s > 0 and self.reach >= 1):

@@ -48,18 +48,14 @@ _OTHER_LIMITS = 0.1
 
 @dataclass(frozen=True)
 class Georeferenced:
-    """Result of `georeference`.
-
-    Attributes
-    ----------
-    points : the control points and the fit.
-    record : scale, north and place of the map from now on.
-    notes : one line each, for the user.
-    """
+    """Result of `georeference`."""
 
     points: ControlPointsRecord
+    """The control points and the fit."""
     record: GeoreferenceRecord
+    """Scale, north and place of the map from now on."""
     notes: tuple[str, ...] = ()
+    """One line each, for the user."""
 
     def all_notes(self) -> tuple[str, ...]:
         """Disagreements between the sources of scale, contradictions, and the notes."""

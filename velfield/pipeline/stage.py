@@ -53,50 +53,46 @@ class Line:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage.
-
-    Attributes
-    ----------
-    name : of its commit records, and wherever a program reads it.
-    version : to be raised when its results change.
-    label : for people.
-    lines : of its summary; the first that applies is printed.
-    unit : function ``(plan, *part, *blocks) -> StageResult``; ``part`` is the unit's frames or group of tiles, none
-        where the stage is whole; ``blocks`` are the results of the stage's blocks, where it has any.
-    block : function ``(plan, frames) -> Any`` of a few frames: the costly part of a unit, and the parallel one.
-    tiles : function ``(plan) -> groups`` of a stage that is cut by tiles.
-    prepare : function ``(plan) -> None`` that creates the stage's store before its units fill it.
-    store : the store's path in the run folder.
-    after : stages that it reads.
-    inputs : of the inputs (`schemas.records.InputsRecord`), those that it reads.
-    config : of the configuration (`schemas.flight.FlightConfig`), the sections and keys that it reads.
-    unread : keys of those sections that it does not read.
-    cut : how it is cut; a unit of frames is lost with the same unit of a stage that it reads.
-    new_workers : in a long flight its workers start without what earlier stages left in theirs: its memory grows with
-        the flight, whose tables it reads as a whole, or is the most that any takes.
-    new_base, remap : what `velfield reprocess` makes of it; ``remap`` is ``(plan, *part, rebase) -> StageResult``.
-    from_tracks : function ``(plan) -> StageResult`` in place of ``unit``, where tracks are given and no frames: it
-        writes what the stages before would have.
-    """
+    """One stage."""
 
     name: str
+    """Of its commit records, and wherever a program reads it."""
     version: int
+    """To be raised when its results change."""
     label: str
+    """For people."""
     lines: tuple[Line, ...]
+    """Of its summary; the first that applies is printed."""
     unit: str
+    """Function ``(plan, *part, *blocks) -> StageResult``; ``part`` is the unit's frames or group of tiles, none where
+    the stage is whole; ``blocks`` are the results of the stage's blocks, where it has any."""
     block: str | None = None
+    """Function ``(plan, frames) -> Any`` of a few frames: the costly part of a unit, and the parallel one."""
     tiles: str | None = None
+    """Function ``(plan) -> groups`` of a stage that is cut by tiles."""
     prepare: str | None = None
+    """Function ``(plan) -> None`` that creates the stage's store before its units fill it."""
     store: str | None = None
+    """The store's path in the run folder."""
     after: tuple[str, ...] = ()
+    """Stages that it reads."""
     inputs: tuple[str, ...] = ()
+    """Of the inputs (`schemas.records.InputsRecord`), those that it reads."""
     config: tuple[str, ...] = ()
+    """Of the configuration (`schemas.flight.FlightConfig`), the sections and keys that it reads."""
     unread: tuple[str, ...] = ()
+    """Keys of those sections that it does not read."""
     cut: Cut = Cut.WHOLE
+    """How it is cut; a unit of frames is lost with the same unit of a stage that it reads."""
     new_workers: bool = False
+    """In a long flight its workers start without what earlier stages left in theirs: its memory grows with the flight,
+    whose tables it reads as a whole, or is the most that any takes."""
     new_base: NewBase = NewBase.COMPUTED
     remap: str | None = None
+    """What `velfield reprocess` makes of it; ``remap`` is ``(plan, *part, rebase) -> StageResult``."""
     from_tracks: str | None = None
+    """Function ``(plan) -> StageResult`` in place of ``unit``, where tracks are given and no frames: it writes what the
+    stages before would have."""
 
     @property
     def essential(self) -> bool:

@@ -10,17 +10,13 @@ from velfield.run.commits import WHOLE, commit_path, read_commit
 
 @dataclass(frozen=True)
 class Unit:
-    """One unit of a stage.
-
-    Attributes
-    ----------
-    name : of its commit record.
-    part : its frames (a range) or its group of tiles (row, column), as the one argument of the stage's function; empty
-        where the stage is not cut.
-    """
+    """One unit of a stage."""
 
     name: str
+    """Of its commit record."""
     part: tuple[Any, ...] = ()
+    """Its frames (a range) or its group of tiles (row, column), as the one argument of the stage's function; empty
+    where the stage is not cut."""
 
     @property
     def frames(self) -> range:

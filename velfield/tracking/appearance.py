@@ -86,23 +86,17 @@ def patch_differences(
 
 @dataclass(frozen=True)
 class PreparedCrops:
-    """Upright crops of one frame's detections, prepared for comparison.
-
-    Attributes
-    ----------
-    parts
-        (n, 4, 4, 256) uint8: grey levels, minimum and maximum within half a pixel (by interpolation) of each pixel, and
-        255 on the car; of each, the pixels of even rows and columns, of even rows and odd columns, and so on, 16 x 16
-        in the middle of the crop. At a shift, every second pixel of one crop meets neighbours of one part of the other.
-    spare
-        (n * 4096 + 128,) uint8, the same with 64 bytes before and after: those at its border are read, but not counted.
-    rows
-        (n, 2) int64, first of the 16 odd rows with a pixel on the car, and the one after the last.
-    """
+    """Upright crops of one frame's detections, prepared for comparison."""
 
     parts: ByteArray
+    """(n, 4, 4, 256) uint8: grey levels, minimum and maximum within half a pixel (by interpolation) of each pixel, and
+    255 on the car; of each, the pixels of even rows and columns, of even rows and odd columns, and so on, 16 x 16 in
+    the middle of the crop. At a shift, every second pixel of one crop meets neighbours of one part of the other."""
     spare: ByteArray
+    """(n * 4096 + 128,) uint8, the same with 64 bytes before and after: those at its border are read, but not
+    counted."""
     rows: IntArray
+    """(n, 2) int64, first of the 16 odd rows with a pixel on the car, and the one after the last."""
 
 
 def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> PreparedCrops:

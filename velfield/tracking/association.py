@@ -30,47 +30,34 @@ from velfield.tracking.gates import DetectionStates, Limits
 
 @dataclass(frozen=True)
 class FrameTable:
-    """Detections of one frame with their positions, axes, appearance and time.
-
-    Attributes
-    ----------
-    frame, time_s
-        Index in ``frames.zarr``, and its true time.
-    registered
-        Whether it is used: registered, and not flagged.
-    residual_px
-        Registration residual, base px; widens the gates.
-    detection_id, x_px, y_px, orientation_rad, orientation_sd_rad, score
-        (n,) as in the detections' table. Orientations may be NaN.
-    patches
-        (n, length, width) uint8 oriented patches in working px; None: appearance is not used.
-    crops
-        (n, 32, 32) uint8 upright crops in working px, centred on ``round(x_work), round(y_work)``; None: displacements
-        are not refined.
-    x_work, y_work
-        (n,) positions in working px of this frame's rectified image; with ``crops`` only.
-    working_scale
-        Working px a base px.
-    registration_sd_px
-        Standard error of the frame's transform, base px; part of a displacement's standard deviation.
-    """
+    """Detections of one frame with their positions, axes, appearance and time."""
 
     frame: int
     time_s: float
+    """Index in ``frames.zarr``, and its true time."""
     registered: bool
+    """Whether it is used: registered, and not flagged."""
     residual_px: float
+    """Registration residual, base px; widens the gates."""
     detection_id: IntArray
     x_px: FloatArray
     y_px: FloatArray
     orientation_rad: FloatArray
     orientation_sd_rad: FloatArray
     score: FloatArray
+    """(n,) as in the detections' table. Orientations may be NaN."""
     patches: ByteArray | None = None
+    """(n, length, width) uint8 oriented patches in working px; None: appearance is not used."""
     crops: ByteArray | None = None
+    """(n, 32, 32) uint8 upright crops in working px, centred on ``round(x_work), round(y_work)``; None: displacements
+    are not refined."""
     x_work: FloatArray | None = None
     y_work: FloatArray | None = None
+    """(n,) positions in working px of this frame's rectified image; with ``crops`` only."""
     working_scale: float = 1.0
+    """Working px a base px."""
     registration_sd_px: float = 0.0
+    """Standard error of the frame's transform, base px; part of a displacement's standard deviation."""
 
     def take(self, rows: IntArray) -> "FrameTable":
         """Some of the detections, in this order."""
@@ -149,24 +136,16 @@ def window_frames(registered: Sequence[bool], times_s: Sequence[float], starts: 
 
 @dataclass(frozen=True)
 class LinkedTriples:
-    """Accepted triples of detections of one window.
-
-    Attributes
-    ----------
-    start
-        Index, among the registered frames, of the window's first.
-    detections
-        (m, 3) index of the detection in each frame.
-    differences
-        (m, 2) appearance difference of both links, grey levels; NaN where unknown.
-    confidence
-        (m,) in [0, 1].
-    """
+    """Accepted triples of detections of one window."""
 
     start: int
+    """Index, among the registered frames, of the window's first."""
     detections: IntArray
+    """(m, 3) index of the detection in each frame."""
     differences: FloatArray
+    """(m, 2) appearance difference of both links, grey levels; NaN where unknown."""
     confidence: FloatArray
+    """(m,) in [0, 1]."""
 
 
 def tracklet_table(

@@ -87,25 +87,17 @@ _NEAR_MEDIAN, _NEAR_STEPS = np.float32(8.0), 8
 
 @dataclass(frozen=True)
 class UprightCrops:
-    """Upright crops of one frame's detections.
-
-    Attributes
-    ----------
-    pixels
-        (n, side, side) uint8, working px.
-    centre_x_px, centre_y_px
-        (n,) positions of the crops' centre pixel (side // 2), base px.
-    axis_rad
-        (n,) axis of each car.
-    scale
-        Working px a base px.
-    """
+    """Upright crops of one frame's detections."""
 
     pixels: ByteArray
+    """(n, side, side) uint8, working px."""
     centre_x_px: FloatArray
     centre_y_px: FloatArray
+    """(n,) positions of the crops' centre pixel (side // 2), base px."""
     axis_rad: FloatArray
+    """(n,) axis of each car."""
     scale: float
+    """Working px a base px."""
 
     @cached_property
     def prepared(self) -> "AlignableCrops":
@@ -114,26 +106,18 @@ class UprightCrops:
 
 
 class AlignableCrops(NamedTuple):
-    """Crops prepared for alignment, n of them: all that does not depend on the other crop.
-
-    Attributes
-    ----------
-    grey
-        (n, side, side) float32, blurred grey levels.
-    weight
-        (n, 23, 24) float32, over the box that holds the car, with the crop's centre at (11, 12).
-    pixels
-        (n, 276) int16, flat index into a 40 x 40 image about the centre, at (20, 20), of every second pixel on the car,
-        some from all over it first.
-    counts
-        (n, 3) int64: number of ``pixels``; first row of the box in which a pixel has weight, and the row after the
-        last.
-    """
+    """Crops prepared for alignment, n of them: all that does not depend on the other crop."""
 
     grey: Float32Array
+    """(n, side, side) float32, blurred grey levels."""
     weight: Float32Array
+    """(n, 23, 24) float32, over the box that holds the car, with the crop's centre at (11, 12)."""
     pixels: NDArray[np.int16]
+    """(n, 276) int16, flat index into a 40 x 40 image about the centre, at (20, 20), of every second pixel on the car,
+    some from all over it first."""
     counts: IntArray
+    """(n, 3) int64: number of ``pixels``; first row of the box in which a pixel has weight, and the row after the
+    last."""
 
 
 def refine_links(

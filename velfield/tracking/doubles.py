@@ -123,27 +123,18 @@ def find_split_tracks(positions: pd.DataFrame, metres: float) -> pd.Series:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Pairs of tracks that are near in a frame, by track and time.
-
-    Attributes
-    ----------
-    one, other
-        (n,) ids of the tracks.
-    time_s
-        (n,)
-    xy_m, offset_m
-        (2, n) position of one, and offset of the other, m: a row is in one piece of memory, so that sums over it are
-        accurate.
-    seen
-        (n,) how many of the two are seen.
-    """
+    """Pairs of tracks that are near in a frame, by track and time."""
 
     one: IntArray
     other: IntArray
+    """(n,) ids of the tracks."""
     time_s: FloatArray
     xy_m: FloatArray
     offset_m: FloatArray
+    """(2, n) position of one, and offset of the other, m: a row is in one piece of memory, so that sums over it are
+    accurate."""
     seen: IntArray
+    """(n,) how many of the two are seen."""
 
     def __len__(self) -> int:
         return len(self.one)

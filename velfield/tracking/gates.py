@@ -21,28 +21,20 @@ from schemas.flight import TrackingConfig, assumed_gsd_m
 
 @dataclass(frozen=True)
 class Limits:
-    """The gates of a flight in base pixels, seconds and radians.
-
-    Attributes
-    ----------
-    max_speed_px_per_s, stationary_speed_px_per_s, max_acceleration_px_per_s2
-        Physical limits, base px.
-    max_turn_rad, max_axis_offset_rad
-        Angles between the two segments, and between motion and the car's axis.
-    jitter_px, jitter_sigmas
-        Standard deviation of a detection's position, base px, and by how many of them gates are widened.
-    max_interval_s
-        Longest interval between two frames of a window.
-    """
+    """The gates of a flight in base pixels, seconds and radians."""
 
     max_speed_px_per_s: float
     stationary_speed_px_per_s: float
     max_acceleration_px_per_s2: float
+    """Physical limits, base px."""
     max_turn_rad: float
     max_axis_offset_rad: float
+    """Angles between the two segments, and between motion and the car's axis."""
     jitter_px: float
     jitter_sigmas: float
+    """Standard deviation of a detection's position, base px, and by how many of them gates are widened."""
     max_interval_s: float
+    """Longest interval between two frames of a window."""
 
     @classmethod
     def from_config(cls, config: TrackingConfig, gsd_m: float | None) -> "Limits":
@@ -94,26 +86,18 @@ TYPICAL_ACCELERATION_FRACTION = 0.1
 
 @dataclass(frozen=True)
 class DetectionStates:
-    """Positions and axes of the detections of one frame, with their standard deviations.
-
-    Attributes
-    ----------
-    x_px, y_px
-        (n,) base px.
-    axis_rad, axis_sd_rad
-        (n,) axial, [0, pi); NaN: unknown, and not tested.
-    sd_px
-        Standard deviation of a position along x or y, base px.
-    time_s
-        Time of the frame.
-    """
+    """Positions and axes of the detections of one frame, with their standard deviations."""
 
     x_px: FloatArray
     y_px: FloatArray
+    """(n,) base px."""
     axis_rad: FloatArray
     axis_sd_rad: FloatArray
+    """(n,) axial, [0, pi); NaN: unknown, and not tested."""
     sd_px: float
+    """Standard deviation of a position along x or y, base px."""
     time_s: float
+    """Time of the frame."""
 
     def take(self, rows: IntArray) -> "DetectionStates":
         """States of the given detections, in this order; a row may occur more than once."""
@@ -123,25 +107,17 @@ class DetectionStates:
 
 @dataclass(frozen=True)
 class Links:
-    """Candidate links between two consecutive frames, sorted by the earlier detection.
-
-    Attributes
-    ----------
-    first, second
-        (m,) indices of the detections in the earlier and the later frame.
-    axis_cost
-        (m,) half the squared sideways displacement in standard deviations.
-    interval_s
-        Time from the earlier to the later frame.
-    rejected
-        Counts: tried, by speed, by axis.
-    """
+    """Candidate links between two consecutive frames, sorted by the earlier detection."""
 
     first: IntArray
     second: IntArray
+    """(m,) indices of the detections in the earlier and the later frame."""
     axis_cost: FloatArray
+    """(m,) half the squared sideways displacement in standard deviations."""
     interval_s: float
+    """Time from the earlier to the later frame."""
     rejected: tuple[int, int, int]
+    """Counts: tried, by speed, by axis."""
 
 
 def gate_links(before: DetectionStates, after: DetectionStates, limits: Limits) -> Links:
@@ -203,22 +179,15 @@ def _axis_test(
 
 @dataclass(frozen=True)
 class LinkPairs:
-    """Pairs of links that share their middle detection and pass the gates on turn and acceleration.
-
-    Attributes
-    ----------
-    link_01, link_12
-        (m,) indices of the links.
-    motion_cost
-        (m,) half the squared deviation from constant velocity, in standard deviations.
-    rejected
-        Counts: tried, by turn, by acceleration.
-    """
+    """Pairs of links that share their middle detection and pass the gates on turn and acceleration."""
 
     link_01: IntArray
     link_12: IntArray
+    """(m,) indices of the links."""
     motion_cost: FloatArray
+    """(m,) half the squared deviation from constant velocity, in standard deviations."""
     rejected: tuple[int, int, int]
+    """Counts: tried, by turn, by acceleration."""
 
 
 def gate_link_pairs(

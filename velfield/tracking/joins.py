@@ -62,42 +62,29 @@ END_COLUMNS = [
 
 @dataclass(frozen=True)
 class EndContext:
-    """Properties of the ends and the starts of tracks, apart from their motion; tracks in the order of their ids.
-
-    Attributes
-    ----------
-    end_vanishes, start_vanishes
-        (tracks,) whether the end, or the start, lies in the middle of the frames and of the flight.
-    end_looks, start_looks
-        (tracks, 16, 6) mean looks before the end and after the start (`velfield.tracking.dimensions.looks`); NaN where
-        unknown.
-    length_m
-        (tracks,) what each vehicle is longer than, but for one in six: its length less a standard deviation; NaN where
-        unknown.
-    """
+    """Properties of the ends and the starts of tracks, apart from their motion; tracks in the order of their ids."""
 
     end_vanishes: Mask
     start_vanishes: Mask
+    """(tracks,) whether the end, or the start, lies in the middle of the frames and of the flight."""
     end_looks: FloatArray
     start_looks: FloatArray
+    """(tracks, 16, 6) mean looks before the end and after the start (`velfield.tracking.dimensions.looks`); NaN where
+    unknown."""
     length_m: FloatArray
+    """(tracks,) what each vehicle is longer than, but for one in six: its length less a standard deviation; NaN where
+    unknown."""
 
 
 @dataclass(frozen=True)
 class ClosedGaps:
-    """Tracks after gap closing.
-
-    Attributes
-    ----------
-    tracks
-        (tracks,) int64 the track that each is part of: the smallest of the ids of those that were joined.
-    joins
-        A row a join, in time order: ``track_id``, ``before`` and ``after`` (ids of the tracks that it joins),
-        ``end_time_s``, ``start_time_s``, ``probability`` that it is right.
-    """
+    """Tracks after gap closing."""
 
     tracks: IntArray
+    """(tracks,) int64 the track that each is part of: the smallest of the ids of those that were joined."""
     joins: pd.DataFrame
+    """A row a join, in time order: ``track_id``, ``before`` and ``after`` (ids of the tracks that it joins),
+    ``end_time_s``, ``start_time_s``, ``probability`` that it is right."""
 
 
 def close_gaps(

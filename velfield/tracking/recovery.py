@@ -54,25 +54,17 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Recovered:
-    """Tracks after gap closing, extension and filling.
-
-    Attributes
-    ----------
-    tracks
-        (chains,) int64 the track that each chain of tracklets is part of.
-    joins
-        As of `velfield.tracking.joins.ClosedGaps`.
-    track_id, candidate
-        (k,) each: candidates that belong to tracks.
-    gaps
-        Gaps of the joins, with the candidates in them: positions of vehicles while nothing was detected.
-    """
+    """Tracks after gap closing, extension and filling."""
 
     tracks: IntArray
+    """(chains,) int64 the track that each chain of tracklets is part of."""
     joins: pd.DataFrame
+    """As of `velfield.tracking.joins.ClosedGaps`."""
     track_id: IntArray
     candidate: IntArray
+    """(k,) each: candidates that belong to tracks."""
     gaps: list["Gap"]
+    """Gaps of the joins, with the candidates in them: positions of vehicles while nothing was detected."""
 
 
 def recover_tracks(

@@ -79,28 +79,19 @@ def speed_sd_m_per_s(position_sd_m: float) -> float:
 
 @dataclass(frozen=True)
 class CleanTracks:
-    """Tracks without their errors.
-
-    Attributes
-    ----------
-    track
-        (m,) id of the track of each position: new ones where a track was cut.
-    xy_m
-        (m, 2) smoothed positions.
-    errors
-        Errors of the unsmoothed positions; None: not known, or too small to smooth.
-    position_sd_m, velocity_sd_m_per_s
-        Standard deviations along one axis that are left; 0 where nothing was smoothed.
-    cuts
-        Number of places at which a track jumped from one vehicle to another.
-    """
+    """Tracks without their errors."""
 
     track: IntArray
+    """(m,) id of the track of each position: new ones where a track was cut."""
     xy_m: FloatArray
+    """(m, 2) smoothed positions."""
     errors: PositionErrors | None
+    """Errors of the unsmoothed positions; None: not known, or too small to smooth."""
     position_sd_m: float
     velocity_sd_m_per_s: float
+    """Standard deviations along one axis that are left; 0 where nothing was smoothed."""
     cuts: int
+    """Number of places at which a track jumped from one vehicle to another."""
 
     @property
     def notes(self) -> list[str]:

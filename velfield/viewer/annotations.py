@@ -26,25 +26,17 @@ _OPTIONAL = ("orientation_rad", "length_px", "width_px")
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames to annotate.
-
-    Attributes
-    ----------
-    names
-        Name of each in labels.
-    width, height
-        Size of every frame, px.
-    read
-        Returns the k-th as (h, w) uint8, raw pixels.
-    found
-        Vehicles that a run tracks in them: what a frame without labels begins with.
-    """
+    """Frames to annotate."""
 
     names: tuple[str, ...]
+    """Name of each in labels."""
     width: int
     height: int
+    """Size of every frame, px."""
     read: Callable[[int], GreyImage]
+    """Returns the k-th as (h, w) uint8, raw pixels."""
     found: tuple[MarkedCar, ...] = ()
+    """Vehicles that a run tracks in them: what a frame without labels begins with."""
 
 
 def frames_to_annotate(path: Path, *, max_frames: int) -> Frames:

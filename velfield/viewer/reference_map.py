@@ -51,18 +51,12 @@ RGBAImage = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class TileServer:
-    """A tile server that the user named.
-
-    Attributes
-    ----------
-    template
-        Address of a tile, with ``{z}``, ``{x}`` and ``{y}``, or ``{-y}`` where rows are counted from the south.
-    origin
-        Scheme, host and port: what the page may load images from.
-    """
+    """A tile server that the user named."""
 
     template: str
+    """Address of a tile, with ``{z}``, ``{x}`` and ``{y}``, or ``{-y}`` where rows are counted from the south."""
     origin: str
+    """Scheme, host and port: what the page may load images from."""
 
 
 @dataclass(frozen=True)

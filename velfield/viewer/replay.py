@@ -43,23 +43,16 @@ def chunk_count(duration_s: float) -> int:
 
 @dataclass(frozen=True)
 class Paths:
-    """Positions of all vehicles, by vehicle and time: (m,) each.
-
-    Attributes
-    ----------
-    vehicle
-        Its number.
-    time_s, x_px, y_px
-        When and where, base pixels.
-    gap
-        Whether nothing was seen of it until its next position.
-    """
+    """Positions of all vehicles, by vehicle and time: (m,) each."""
 
     vehicle: IntArray
+    """Its number."""
     time_s: FloatArray
     x_px: FloatArray
     y_px: FloatArray
+    """When and where, base pixels."""
     gap: Mask
+    """Whether nothing was seen of it until its next position."""
 
     def take(self, rows: IntArray | Mask) -> "Paths":
         """Some of the positions."""

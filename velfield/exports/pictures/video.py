@@ -89,31 +89,21 @@ def _images(run: Run, scene: "_Scene", frames: list[int]) -> Iterator[tuple[int,
 
 @dataclass(frozen=True)
 class _Scene:
-    """Parts that are the same in all images of the video, at its size.
-
-    Attributes
-    ----------
-    scale
-        Video pixels a base pixel.
-    base
-        (h, w) base image.
-    field, known
-        (h, w, 3) colours of the modal speed, and (h, w) where vehicles move.
-    panel
-        (h, legend, 3) legend.
-    top_px_per_s
-        Speed of the last colour.
-    legend_scale
-        For speeds as text.
-    """
+    """Parts that are the same in all images of the video, at its size."""
 
     scale: float
+    """Video pixels a base pixel."""
     base: GreyImage
+    """(h, w) base image."""
     field: RGBImage
     known: Mask
+    """(h, w, 3) colours of the modal speed, and (h, w) where vehicles move."""
     panel: RGBImage
+    """(h, legend, 3) legend."""
     top_px_per_s: float
+    """Speed of the last colour."""
     legend_scale: MapScale
+    """For speeds as text."""
     tracks: "_Tracks"
 
     @classmethod

@@ -16,28 +16,24 @@ from velfield.run.run import Run
 
 @dataclass(frozen=True)
 class RoadLane:
-    """A lane, or a part of one between intersections.
-
-    Attributes
-    ----------
-    number, name : number in the network; ``lane2``, or ``lane2#0``, ``lane2#1`` of lane 2 in several parts.
-    xy_m : (n, 2) centre line in the direction of travel, x to the right of the map, y upwards.
-    width_m : of the lane.
-    speed_m_per_s : space-mean speed of the vehicles on it; None where too few were seen.
-    high_speed_m_per_s : 85th percentile of the speeds along the whole lane.
-    vehicles : number of tracks on it.
-    begins_at, ends_at : numbers of the intersections at which it begins and ends; None: at none.
-    """
+    """A lane, or a part of one between intersections."""
 
     number: int
     name: str
+    """Number in the network; ``lane2``, or ``lane2#0``, ``lane2#1`` of lane 2 in several parts."""
     xy_m: FloatArray
+    """(n, 2) centre line in the direction of travel, x to the right of the map, y upwards."""
     width_m: float
+    """Of the lane."""
     speed_m_per_s: float | None
+    """Space-mean speed of the vehicles on it; None where too few were seen."""
     high_speed_m_per_s: float
+    """85th percentile of the speeds along the whole lane."""
     vehicles: int
+    """Number of tracks on it."""
     begins_at: int | None = None
     ends_at: int | None = None
+    """Numbers of the intersections at which it begins and ends; None: at none."""
 
 
 @dataclass(frozen=True)

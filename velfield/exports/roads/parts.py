@@ -15,27 +15,18 @@ from velfield.analysis.lanes.model import Lane, LaneGraph, LaneSamples
 
 @dataclass(frozen=True)
 class LaneParts:
-    """Parts of lanes outside intersections.
-
-    Attributes
-    ----------
-    graph
-        The parts as lanes, numbered anew, with the samples on them; without connections and junctions.
-    lanes
-        Number of the lane of each part.
-    names
-        ``lane2``; ``lane2#0``, ``lane2#1`` of a lane in several parts.
-    ends
-        Numbers of the intersections at which each part begins and ends; None: at none.
-    connections
-        Pairs of parts (from, to) along which vehicles drive.
-    """
+    """Parts of lanes outside intersections."""
 
     graph: LaneGraph
+    """The parts as lanes, numbered anew, with the samples on them; without connections and junctions."""
     lanes: tuple[int, ...]
+    """Number of the lane of each part."""
     names: tuple[str, ...]
+    """``lane2``; ``lane2#0``, ``lane2#1`` of a lane in several parts."""
     ends: tuple[tuple[int | None, int | None], ...]
+    """Numbers of the intersections at which each part begins and ends; None: at none."""
     connections: tuple[tuple[int, int], ...]
+    """Pairs of parts (from, to) along which vehicles drive."""
 
 
 def cut_at_intersections(graph: LaneGraph, hulls_m: Mapping[int, FloatArray]) -> LaneParts:

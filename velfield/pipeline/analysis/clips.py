@@ -25,21 +25,14 @@ _EDGE_PX = 4
 
 @dataclass(frozen=True)
 class Frames:
-    """Where pictures come from.
-
-    Attributes
-    ----------
-    times_s
-        (frames,) times, s.
-    read
-        Returns a raw frame (h, w).
-    transform
-        Returns a frame's map of raw to base pixels; None: it is not registered.
-    """
+    """Where pictures come from."""
 
     times_s: FloatArray
+    """(frames,) times, s."""
     read: Callable[[int], GreyImage]
+    """Returns a raw frame (h, w)."""
     transform: "Callable[[int], RawToBase | None]"
+    """Returns a frame's map of raw to base pixels; None: it is not registered."""
 
 
 def unusual_clips(analysis: TrafficAnalysis, frames: Frames) -> Iterator[tuple[int, bytes]]:

@@ -31,39 +31,29 @@ _INSIDE = 0.5
 
 @dataclass(frozen=True)
 class LoadedTracks:
-    """Tracks of a file on a grid of base pixels.
-
-    Attributes
-    ----------
-    table
-        ``track_id, source_id, frame, time_s, x_px, y_px``, smoothed, by track and time; and ``length_m``, ``width_m``
-        where the file has them.
-    shape, gsd_m
-        (height, width) of the grid, px, and metres a pixel.
-    base
-        The base image that was given.
-    crs_wkt, affine
-        Reference system of the grid and (column, row) of pixel corners to its coordinates: a UTM zone where the file
-        has degrees, else that of the base image; None without one.
-    north_rad
-        Direction of north on the grid, from x towards y (down): of true north by the reference system, else of the grid
-        of the file's map, up to some 3 degrees from it; None: not known.
-    position_sd_m, displacement_sd_m
-        Standard deviations of a smoothed position, and of a displacement from one position to the next, along one axis.
-    notes
-        Notes on what was read and done, one line each.
-    """
+    """Tracks of a file on a grid of base pixels."""
 
     table: pd.DataFrame
+    """``track_id, source_id, frame, time_s, x_px, y_px``, smoothed, by track and time; and ``length_m``, ``width_m``
+    where the file has them."""
     shape: tuple[int, int]
     gsd_m: float
+    """(height, width) of the grid, px, and metres a pixel."""
     base: BaseRaster | None
+    """The base image that was given."""
     crs_wkt: str | None
     affine: tuple[float, float, float, float, float, float] | None
+    """Reference system of the grid and (column, row) of pixel corners to its coordinates: a UTM zone where the file has
+    degrees, else that of the base image; None without one."""
     north_rad: float | None
+    """Direction of north on the grid, from x towards y (down): of true north by the reference system, else of the grid
+    of the file's map, up to some 3 degrees from it; None: not known."""
     position_sd_m: float
     displacement_sd_m: float
+    """Standard deviations of a smoothed position, and of a displacement from one position to the next, along one
+    axis."""
     notes: tuple[str, ...]
+    """Notes on what was read and done, one line each."""
 
     def sizes_m(self, track_id: IntArray) -> FloatArray:
         """Length and width (n, 2), m, medians over each of the tracks (n,); NaN where the file does not have them."""
