@@ -2,6 +2,7 @@
 
 import errno
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,3 +111,14 @@ class Failure:
 
     def __bool__(self) -> bool:
         return False
+
+
+def list_text(names: Sequence[str]) -> str:
+    """Names for people.
+
+    Examples
+    --------
+    >>> list_text(["N", "S", "W"])
+    'N, S and W'
+    """
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

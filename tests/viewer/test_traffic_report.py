@@ -9,10 +9,10 @@ import pytest
 from schemas.analysis import AnalysisRecord, EstimateRecord
 from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, crossroads, drive, gather
 from velfield.analysis.answers import duration_text
+from velfield.analysis.approaches import approach_delays, arms_without_delay, lane_names
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.tables import all_tables, flow_table, limit_table
 from velfield.report.drawing import new_figure, pages_bytes
-from velfield.report.traffic.approaches import approach_delays, arms_without_delay, lane_names
 from velfield.report.traffic.diagrams import draw_delays, draw_queues, draw_time_space, red_times, traffic_diagrams
 from velfield.report.traffic.first_page import FirstPage, first_page
 from velfield.report.traffic.report import report_html

@@ -6,25 +6,29 @@ from typing import Literal
 
 import numpy as np
 
-from schemas.analysis import Turn
 from schemas.arrays import FloatArray
 from schemas.export import PER_M_PER_S, SpeedUnit
 from schemas.flight import STATIONARY_SPEED_M_PER_S
+from velfield.analysis.approaches import (
+    TURNS,
+    approach_delays,
+    arms_without_delay,
+    lane_text,
+    longest_queues,
+    queue_text,
+)
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.lanes.junctions import inside_hull
-from velfield.analysis.movements.movements import JunctionMovements
-from velfield.analysis.signals.cycles import JunctionSignal, Queue, green_duration_s, queues
+from velfield.analysis.movements.movements import MIN_DELAYED, JunctionMovements
+from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import MOVES_M, Trajectories
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
-from velfield.errors import count_text
+from velfield.errors import count_text, list_text
 
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
-DELAY_OF_PART = " or more"
-"""Said after a delay of vehicles that come into view when they wait already."""
-_TURNS: dict[Turn, str] = {"straight": "straight on", "left": "left", "right": "right", "u-turn": "back"}
 _AT_JUNCTION_M, _ON_LANE_M, _ROAD_M = 20.0, 10.0, 50.0
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
@@ -80,6 +84,7 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
         else:
             yield _signal(analysis, signal)
     for found in analysis.movements:
+        yield from _delays(analysis, found)
         for arm, (lane, queue) in longest_queues(analysis, found).items():
             text = f"longest when green begins, {lane_text(found, lane)}: {queue_text(queue)}"
             yield Answer(
@@ -150,10 +155,8 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
     found = [m for j in analysis.movements if kinds[j.junction.number] != "merge" for m in j.movements]
     for m in sorted(found, key=lambda m: (not analysis.ways_meet(m.junction), -(m.seen + m.inferred))):
         share = _share_text(m.share, m.seen + m.inferred, m.arm_in)
-        partly = DELAY_OF_PART if analysis.delay_is_partial(m.junction, m.arm_in) else ""
-        delay = f", delay {estimate_text(m.delay_s, 's')}{partly}" if m.delay_s else ""
         subject = f"{_place(analysis, m.junction)}, {m.arm_in} to {m.arm_out}"
-        text = f"{count_text(m.seen + m.inferred, 'vehicle')}{share}{delay}"
+        text = f"{count_text(m.seen + m.inferred, 'vehicle')}{share}"
         yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
     merges = [j for j in analysis.movements if kinds[j.junction.number] == "merge" and j.movements]
     if merges:
@@ -243,31 +246,30 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 
-def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, tuple[int, Queue]]:
-    """The longest queue at a green of each arm of a junction whose signal is known, where vehicles queue, and its
-    lane."""
-    signal, arm = analysis.signals.get(found.junction.number), found.gates.arms_in
-    out: dict[str, tuple[int, Queue]] = {}
-    for stream in signal.streams if signal else ():
-        lane = stream.stream.approach.lane
-        name = arm.get(lane)
-        for queue in queues(stream.stream, stream.green_s):
-            if name and queue.vehicles.value and (name not in out or queue.length_m > out[name][1].length_m):
-                out[name] = lane, queue
-    return out
-
-
-def lane_text(found: JunctionMovements, lane: int) -> str:
-    """A lane into a junction by the ways that its vehicles go: ``straight on to E and right to S (lane 0)``."""
-    ways = [f"{_TURNS[m.turn]} to {m.arm_out}" for m in found.movements_of(lane)]
-    return f"{list_text(ways)} (lane {lane})" if ways else f"on lane {lane}"
+def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:
+    """The delay of each approach of a junction where ways meet; of the others what is missing, in one answer."""
+    if not analysis.ways_meet(found.junction.number):
+        return
+    subject, delays = f"junction {found.junction.number}", approach_delays(analysis, found)
+    for delay in delays:
+        yield Answer("delay", f"{subject} from {delay.arm}", "found", f"mean {delay.text}", delay.delay_s, "s")
+    unknown = arms_without_delay(found, delays)
+    few = [arm for arm in unknown if found.timed(arm) < MIN_DELAYED]
+    stop = [arm for arm in unknown if arm not in few]
+    if few:
+        seen = list_text([str(found.timed(arm)) for arm in few])
+        text = f"too little data: {seen} vehicles were seen from 60 m before it to behind it, of {MIN_DELAYED} needed"
+        yield Answer("delay", f"{subject} from {list_text(few)}", "too little data", text)
+    if stop:
+        text = "too little data: hardly one vehicle passes or comes without a stop, to compare with"
+        yield Answer("delay", f"{subject} from {list_text(stop)}", "too little data", text)
 
 
 def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -> str:
     """Where the lanes of a phase come from, and which turns their vehicles take."""
     found = next(found for found in analysis.movements if found.junction.number == junction)
     mine = {lane: arm for lane, arm in found.gates.arms_in.items() if lane in lanes}
-    turns = dict.fromkeys(_TURNS[m.turn] for lane in mine for m in found.movements_of(lane))
+    turns = dict.fromkeys(TURNS[m.turn] for lane in mine for m in found.movements_of(lane))
     ways = f", {list_text([*turns])}" if turns else ""
     arms = f"from {list_text(sorted(set(mine.values())))}{ways} " if mine else ""
     return f"{arms}({lanes_text(lanes)}): " if arms else f"{lanes_text(lanes)}: "
@@ -351,34 +353,6 @@ def lanes_text(lanes: Sequence[int]) -> str:
     ('lane 2', 'lanes 0, 1')
     """
     return f"lane{'s' if len(lanes) != 1 else ''} {', '.join(map(str, lanes))}"
-
-
-def queue_text(queue: Queue) -> str:
-    """Vehicles of a queue, with their interval, and its length; of one whose end is not seen lower bounds.
-
-    Examples
-    --------
-    >>> queue_text(Queue(12.0, Estimate(4, 3, 6, 3), 23.4))
-    '4 vehicles (3 to 6), 23 m'
-    >>> queue_text(Queue(12.0, Estimate(14, 14, 14, 14), 92.0, reaches_edge=True))
-    'at least 14 vehicles over 92 m: where it ends is not seen'
-    """
-    n = queue.vehicles
-    if queue.reaches_edge:
-        return f"at least {count_text(n.low, 'vehicle')} over {queue.length_m:.0f} m: where it ends is not seen"
-    ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
-    return f"{count_text(n.value, 'vehicle')}{ends}, {queue.length_m:.0f} m"
-
-
-def list_text(names: Sequence[str]) -> str:
-    """Names for people.
-
-    Examples
-    --------
-    >>> list_text(["N", "S", "W"])
-    'N, S and W'
-    """
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def duration_text(seconds: float) -> str:

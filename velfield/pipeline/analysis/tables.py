@@ -8,6 +8,7 @@ from schemas.analysis import AnalysisTable
 from schemas.arrays import FloatArray
 from schemas.export import SpeedUnit
 from velfield.analysis.answers import TWO_LEVELS
+from velfield.analysis.approaches import ApproachDelay, approach_delays, longest_queues
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
 from velfield.analysis.flow.volume import LaneFlow, delay_level
@@ -35,6 +36,7 @@ def _tables(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[AnalysisTabl
         lane_table(analysis),
         profile_table(analysis),
         movement_table(analysis),
+        approach_table(analysis),
         *scene_tables(analysis),
         *time_tables(analysis),
         class_table(analysis),
@@ -128,6 +130,38 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     )
     title = "Turning counts"
     return make_table(analysis, "movements", "Movements", title, note, columns, rows, lambda row: row[1].line_m)
+
+
+def approach_table(analysis: TrafficAnalysis) -> AnalysisTable:
+    """Delay and longest queue by approach."""
+    columns: list[Column[tuple[JunctionMovements, str, ApproachDelay | None, Queue | None]]] = [
+        Column("junction", "Junction", "", lambda row: row[0].junction.number),
+        Column("from", "From", "", lambda row: row[1]),
+        Column("vehicles", "Vehicles", "", lambda row: row[0].entered(row[1]), 1),
+        estimates("delay", "Delay", "s", lambda row: row[2].delay_s if row[2] else None),
+        Column("delay_of_part", "Queues end out of view", "", lambda row: "yes" if row[2] and row[2].partly else ""),
+        Column("los", "Level of service", "", lambda row: (row[2].level or None) if row[2] else None),
+        estimates("queue", "Longest queue at a green", "vehicles", lambda row: row[3].vehicles if row[3] else None),
+        Column("queue_length", "Its length", "m", lambda row: row[3].length_m if row[3] else None, 1),
+    ]
+
+    def rows() -> Iterator[tuple[JunctionMovements, str, ApproachDelay | None, Queue | None]]:
+        for found in analysis.movements:
+            delays = {delay.arm: delay for delay in approach_delays(analysis, found)}
+            longest = longest_queues(analysis, found)
+            met = analysis.ways_meet(found.junction.number)
+            for arm in dict.fromkeys(m.arm_in for m in found.movements) if met else ():
+                yield found, arm, delays.get(arm), longest[arm][1] if arm in longest else None
+
+    note = (
+        "Of junctions where ways meet. Delay as in the turning counts, of all vehicles of the approach; where fewer "
+        "than three do not stop, against the pace at which they come. Queues: of the lane with the longest, where a "
+        "signal's cycle is known."
+    )
+    return make_table(
+        analysis, "approaches", "Movements", "Delay and queues by approach", note, columns, rows(),
+        lambda row: next(arm.xy_m for arm in row[0].gates.arms if arm.name == row[1]), named_by=2,
+    )  # fmt: skip
 
 
 def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:

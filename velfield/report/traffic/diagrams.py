@@ -10,15 +10,14 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.export import PER_M_PER_S, SpeedUnit
-from velfield.analysis.answers import list_text
+from velfield.analysis.approaches import ApproachDelay, approach_delays, arms_without_delay, lane_names
 from velfield.analysis.flow.conflicts import LIKELY
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.movements.movements import MIN_PASSES, JunctionMovements
 from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.errors import count_text
+from velfield.errors import count_text, list_text
 from velfield.report.colours import TONES
-from velfield.report.traffic.approaches import ApproachDelay, approach_delays, arms_without_delay, lane_names
 from velfield.report.traffic.place import draw_junctions_aside, draw_map, draw_place, place_caption, place_labels
 from velfield.report.traffic.turning import draw_turning, turning_height_in
 

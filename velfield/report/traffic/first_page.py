@@ -4,21 +4,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import (
-    Answer,
-    duration_text,
-    find_answers,
+from velfield.analysis.answers import Answer, duration_text, find_answers, rate_text, seen_text
+from velfield.analysis.approaches import (
+    ApproachDelay,
+    approach_delays,
+    arms_without_delay,
+    compare_delays,
     lane_text,
-    list_text,
     longest_queues,
     queue_text,
-    rate_text,
-    seen_text,
 )
-from velfield.analysis.movements.movements import MIN_DELAYED, JunctionMovements
+from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.errors import count_text
-from velfield.report.traffic.approaches import ApproachDelay, approach_delays, arms_without_delay, compare_delays
+from velfield.errors import count_text, list_text
 
 _PER_QUESTION, _LINES = 4, 8
 """Most lines of an answer, and of one on junctions, which takes several on each."""
@@ -72,7 +70,6 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     for found_at in _met(analysis):
         number = found_at.junction.number
         waits += _waits(analysis, found_at, delays[number], unknown[number])
-        withheld += [f"delay: junction {number} from {arm}: {_why_no_delay(found_at, arm)}" for arm in unknown[number]]
 
     def why(topic: str, otherwise: str) -> str:
         return "; ".join(reasons.get(topic, [])[:_PER_QUESTION]) or otherwise
@@ -166,14 +163,6 @@ def _waits(
         if name in longest:
             said.append(f"longest queue {queue_text(longest[name][1])}")
         yield f"from {name}: " + "; ".join(said)
-
-
-def _why_no_delay(found: JunctionMovements, arm: str) -> str:
-    timed = found.timed(arm)
-    if timed < MIN_DELAYED:
-        seen = f"{timed} were seen from 60 m before the junction to behind it"
-        return f"too little data: of the {MIN_DELAYED} vehicles that it takes {seen}"
-    return "too little data: 3 vehicles must come, or pass, without a stop"
 
 
 def _danger(answers: list[Answer], duration_s: float) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Approaches of a junction for people: names of their lanes, delay, level of service."""
+"""Approaches of a junction for people: names of their lanes, delay, level of service, queues."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,11 +7,18 @@ from math import hypot, sqrt
 import numpy as np
 from scipy import stats
 
-from velfield.analysis.answers import DELAY_OF_PART, list_text
+from schemas.analysis import Turn
 from velfield.analysis.flow.volume import LOS_SIGNAL_S, LOS_YIELD_S, delay_level
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.movements.movements import JunctionMovements
+from velfield.analysis.signals.cycles import Queue, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.errors import count_text, list_text
+
+TURNS: dict[Turn, str] = {"straight": "straight on", "left": "left", "right": "right", "u-turn": "back"}
+"""Turns for people."""
+_OF_PART = " or more"
+"""Said after a delay of vehicles that come into view when they wait already."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,7 @@ class ApproachDelay:
     def text(self) -> str:
         """The delay and its level, for people."""
         delay, level = self.delay_s, f", level of service {self.level}" if self.level else ""
-        part = DELAY_OF_PART if self.partly else ""
+        part = _OF_PART if self.partly else ""
         return f"{delay.value:.0f} s ({delay.low:.0f} to {delay.high:.0f}, n {delay.n}){part}{level}"
 
 
@@ -98,3 +105,40 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
 def lane_names(found: JunctionMovements) -> dict[int, str]:
     """``from W, lane 3`` of each lane that leads into a junction."""
     return {lane: f"from {arm}, lane {lane}" for lane, arm in found.gates.arms_in.items()}
+
+
+def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, tuple[int, Queue]]:
+    """The longest queue at a green of each arm of a junction whose signal is known, where vehicles queue, and its
+    lane."""
+    signal, arm = analysis.signals.get(found.junction.number), found.gates.arms_in
+    out: dict[str, tuple[int, Queue]] = {}
+    for stream in signal.streams if signal else ():
+        lane = stream.stream.approach.lane
+        name = arm.get(lane)
+        for queue in queues(stream.stream, stream.green_s):
+            if name and queue.vehicles.value and (name not in out or queue.length_m > out[name][1].length_m):
+                out[name] = lane, queue
+    return out
+
+
+def lane_text(found: JunctionMovements, lane: int) -> str:
+    """A lane into a junction by the ways that its vehicles go: ``straight on to E and right to S (lane 0)``."""
+    ways = [f"{TURNS[m.turn]} to {m.arm_out}" for m in found.movements_of(lane)]
+    return f"{list_text(ways)} (lane {lane})" if ways else f"on lane {lane}"
+
+
+def queue_text(queue: Queue) -> str:
+    """Vehicles of a queue, with their interval, and its length; of one whose end is not seen lower bounds.
+
+    Examples
+    --------
+    >>> queue_text(Queue(12.0, Estimate(4, 3, 6, 3), 23.4))
+    '4 vehicles (3 to 6), 23 m'
+    >>> queue_text(Queue(12.0, Estimate(14, 14, 14, 14), 92.0, reaches_edge=True))
+    'at least 14 vehicles over 92 m: where it ends is not seen'
+    """
+    n = queue.vehicles
+    if queue.reaches_edge:
+        return f"at least {count_text(n.low, 'vehicle')} over {queue.length_m:.0f} m: where it ends is not seen"
+    ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
+    return f"{count_text(n.value, 'vehicle')}{ends}, {queue.length_m:.0f} m"
