@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage
-from velfield.camera.lens import Lens
+from velfield.camera.lens import Lens, pinhole
+from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
 
 
 def city(
@@ -37,6 +38,14 @@ def similarity(scale: float, rotation_deg: float, source: FloatArray, target: Fl
     matrix = np.eye(3)
     matrix[:2, :2], matrix[:2, 2] = turn, target - turn @ source
     return matrix
+
+
+def frame_map(matrix: FloatArray, shape: tuple[int, int], lens: Lens | None = None) -> FrameTransform:
+    """The map of a frame of (height, width) by its lens and a homography (3, 3) of undistorted px."""
+    height, width = shape
+    norm = fit_normalisation(np.array([[0.0, 0.0], [width - 1, height - 1]]))
+    polyprojective = PolyprojectiveTransform.from_homography(matrix, norm, norm)
+    return FrameTransform(width=width, height=height, lens=lens or pinhole(shape), polyprojective=polyprojective)
 
 
 def by_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:

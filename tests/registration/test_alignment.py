@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.scenes import city
-from velfield.camera.lens import pinhole
+from tests.scenes import city, frame_map
 from velfield.registration.alignment import (
     HALF_PATCH,
     align_patches,
@@ -16,7 +15,7 @@ from velfield.registration.alignment import (
     smooth_coarse,
     smooth_fine,
 )
-from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
+from velfield.registration.transforms import FrameTransform
 
 SHAPE = HEIGHT, WIDTH = 240, 320
 
@@ -27,11 +26,7 @@ def base() -> np.ndarray:
 
 
 def transform(matrix: np.ndarray) -> FrameTransform:
-    """The map of a frame of `SHAPE` by a homography alone."""
-    corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
-    norm = fit_normalisation(corners)
-    polyprojective = PolyprojectiveTransform.from_homography(matrix, norm, norm)
-    return FrameTransform(width=WIDTH, height=HEIGHT, lens=pinhole(SHAPE), polyprojective=polyprojective)
+    return frame_map(matrix, SHAPE)
 
 
 def shift(x: float, y: float) -> np.ndarray:

@@ -35,10 +35,6 @@ def view(scale: float, rotation_deg: float) -> np.ndarray:
     return similarity(scale, rotation_deg, CENTRE, np.array([310.0, 290.0]))
 
 
-def corners() -> np.ndarray:
-    return np.array([[0.0, 0.0], [319.0, 0.0], [319.0, 239.0], [0.0, 239.0]])
-
-
 @pytest.mark.parametrize("scale", [0.5, 0.25])
 def test_scaling_matrix_maps_pixel_centres_as_area_averaging_does(scale: float) -> None:
     """Coordinate images: each downscaled pixel holds the mean coordinate of the pixels it averages."""
@@ -81,7 +77,8 @@ def test_sift_finds_the_homography_of_any_rotation(ground: np.ndarray, scale: fl
     found = estimate_sift_homography(image, sift_keypoints(ground, 0.25), LENS, scale=0.25)
     assert found.matrix is not None
     assert MIN_INLIERS <= found.inliers <= found.matches
-    error = by_homography(found.matrix, corners()) - by_homography(to_base, corners())
+    corners = frame_corners(*SHAPE[::-1])
+    error = by_homography(found.matrix, corners) - by_homography(to_base, corners)
     assert np.linalg.norm(error, axis=1).max() < 4.0
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from tests.scenes import city
+from tests.scenes import city, frame_map
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.registration import own_base
 from velfield.registration.control_points import ControlPoints
-from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
+from velfield.registration.transforms import FrameTransform
 
 SHAPE = HEIGHT, WIDTH = 120, 160
 GRID = own_base._Grid(WIDTH, HEIGHT, pinhole(SHAPE), (0, 0))
@@ -15,10 +15,7 @@ GRID = own_base._Grid(WIDTH, HEIGHT, pinhole(SHAPE), (0, 0))
 
 def shift(x: float, y: float) -> FrameTransform:
     """The map of a frame that sees the base image from (x, y) on."""
-    norm = fit_normalisation(np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]]))
-    matrix = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
-    polyprojective = PolyprojectiveTransform.from_homography(matrix, norm, norm)
-    return FrameTransform(width=WIDTH, height=HEIGHT, lens=pinhole(SHAPE), polyprojective=polyprojective)
+    return frame_map(np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]]), SHAPE)
 
 
 def wave(rows: np.ndarray, cycles: float = 2.0) -> np.ndarray:

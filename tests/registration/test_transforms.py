@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import DivisionLens, HarrisLens, PolynomialLens
 from velfield.registration.transforms import (
+    ComposedTransform,
     FrameTransform,
     HomographyTransform,
     PolyprojectiveTransform,
@@ -147,7 +148,7 @@ def test_vector_brings_the_transform_back(model: str) -> None:
 def test_composition_is_one_map_after_the_other() -> None:
     rng = np.random.default_rng(6)
     t, p = frame_transform(rng), bent(rng)
-    both = t.then(p)
+    both = ComposedTransform(t, p)
     raw = grid(inset=20)
     there = both.to_base(raw)
     np.testing.assert_allclose(there, p(t.to_base(raw)))

@@ -4,22 +4,20 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.scenes import frame_map
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.detection.frame import ComparableFrame
 from velfield.registration import warp
 from velfield.registration.background import NOT_COVERED, median_of_stack
 from velfield.registration.resampling.cells import CELL_PX
-from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
+from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform
 from velfield.registration.warp import Rectification, footprint, warp_to_base
 
 WIDTH, HEIGHT = 240, 180
 
 
 def moved(matrix: np.ndarray, *, a: float = 0.0) -> FrameTransform:
-    corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
-    lens = HarrisLens(a, 119.5, 89.5, 150.0) if a else pinhole((HEIGHT, WIDTH))
-    p = PolyprojectiveTransform.from_homography(matrix, fit_normalisation(corners), fit_normalisation(corners))
-    return FrameTransform(width=WIDTH, height=HEIGHT, lens=lens, polyprojective=p)
+    return frame_map(matrix, (HEIGHT, WIDTH), HarrisLens(a, 119.5, 89.5, 150.0) if a else None)
 
 
 def wobbling(amplitude_px: float) -> FrameTransform:

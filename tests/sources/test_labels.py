@@ -78,7 +78,6 @@ def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path
         ("l.csv", "filename,left,top,width,height\na.png,1,2,3,4\n", "expected labels as CSV `frame,x_px,y_px"),
         ("l.csv", "frame,x_px,y_px,orientation_rad\na.png,5,5,84\n", "convert degrees"),
         ("l.csv", "frame,x_px,y_px,angle\na.png,5,5,3\n", "expected labels as CSV"),
-        ("l.json", '{"shapes": []}', "found JSON of another kind, expected labels of GeoJSON, COCO"),
         ("l.xml", "<annotation/>", "found XML of another kind"),
         ("l.txt", "1 2 3 4\n", "a .txt that is not YOLO"),
         ("a.txt", "0 0.5 0.5 0.1 0.1\n0 12 34 10 10\n", "fractions of the image"),

@@ -86,14 +86,7 @@ def read_area(path: Path) -> FloatArray:
 def measure_stability(run: Run, *, max_frames: int = 200, within: FloatArray | None = None) -> StabilityScore:
     """Track stationary corners through at most ``max_frames`` frames, sampled over the run.
 
-    Parameters
-    ----------
-    run
-        A finished run.
-    max_frames
-        Largest number of frames.
-    within
-        (n, 2) polygon of the area to measure, base px; None: everywhere.
+    ``within`` (n, 2) is the polygon of the area to measure, base px; None: everywhere.
 
     Raises
     ------

@@ -17,6 +17,8 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.compiled import compiled, kernel
 from velfield.parallel import parallel_map
 
+_ARC_FRACTION, _MIN_ARC_PX = 0.012, 24.0  # of the diagonal: the shortest arc
+_MAX_CURVATURE = 4.0  # over the diagonal
 _MIN_POINTS_PER_ARC, _MAX_POINTS_PER_ARC = 10, 24  # after pooling
 
 
@@ -258,14 +260,10 @@ def detect_arcs(
     min_length_px: float,
     max_curvature_per_px: float,
 ) -> Arcs:
-    """Detect smooth arcs of edge points in one frame.
+    """Detect smooth arcs of edge points in one frame (h, w) uint8.
 
     Parameters
     ----------
-    grey
-        (h, w) uint8.
-    frame
-        Frame number of the arcs.
     smoothing_px
         Sigma of the Gaussian blur before the gradient.
     edge_fraction
@@ -296,29 +294,23 @@ def detect_arcs(
     )
 
 
-def detect_arcs_of_frames(
-    frames: Sequence[GreyImage], *, min_length_px: float, max_curvature_per_px: float
-) -> list[Arcs]:
-    """Arcs of each frame, numbered in their order; the parameters are those of `detect_arcs`."""
-
-    def detect(numbered: tuple[int, GreyImage]) -> Arcs:
-        number, frame = numbered
-        return detect_arcs(frame, frame=number, min_length_px=min_length_px, max_curvature_per_px=max_curvature_per_px)
-
-    return parallel_map(detect, enumerate(frames))
+def detect_and_pool_arcs(frames: Sequence[GreyImage], *, max_points: int) -> Arcs:
+    """Arcs of frames of one size, numbered in their order, with at most ``max_points`` points (`pool_arcs`)."""
+    diagonal_px = float(np.hypot(*frames[0].shape))
+    limits = {
+        "min_length_px": max(_MIN_ARC_PX, _ARC_FRACTION * diagonal_px),
+        "max_curvature_per_px": _MAX_CURVATURE / diagonal_px,
+    }
+    parts = parallel_map(lambda one: detect_arcs(one[1], frame=one[0], **limits), enumerate(frames))
+    return pool_arcs(parts, max_points=max_points)
 
 
 def pool_arcs(parts: list[Arcs], *, max_points: int) -> Arcs:
     """Pool the arcs of several frames, each reduced to means of its points; only the longest if there are too many.
 
-    Parameters
-    ----------
-    parts
-        Arcs of each frame.
-    max_points
-        Points kept, all frames together. The information of an arc grows with its length, not with its number of
-        points, whose errors are correlated: so each arc is divided into the same number of pieces, 10 to 24, fewer the
-        more arcs there are, and each piece is replaced by its mean.
+    The information of an arc grows with its length, not with its number of points, whose errors are correlated: so each
+    arc is divided into the same number of pieces, 10 to 24, fewer the more arcs there are, and each piece is replaced
+    by its mean.
     """
     offsets = np.cumsum([0, *(part.length_px.size for part in parts)])
     arc = np.concatenate([part.arc + offset for part, offset in zip(parts, offsets, strict=False)])

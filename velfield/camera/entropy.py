@@ -30,22 +30,9 @@ def entropy_nats(weights: NDArray[np.floating | np.integer]) -> float:
 def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: float) -> float:
     """Entropy, in nats, of the histogram of the angle and distance of lines through undistorted edge points.
 
-    Parameters
-    ----------
-    arcs
-        Edge points with tangents; each frame has its own histogram.
-    lens
-        The trial lens.
-    angle_bins
-        Bins over half a turn.
-    distance_bin_px
-        Bin width of the distance from the centroid of the points, undistorted px.
-
-    Returns
-    -------
-    float
-        Infinity if a point is outside the lens's domain. A lens that stretches the image spreads the distances over
-        more bins without bending a line; the mean logarithm of the stretch is subtracted.
+    Each frame has its own histogram, of ``angle_bins`` over half a turn and of distances from the centroid of the
+    points, undistorted px. Infinity if a point is outside the lens's domain. A lens that stretches the image spreads
+    the distances over more bins without bending a line; the mean logarithm of the stretch is subtracted.
     """
     xy = lens.undistort_points(arcs.xy)
     tangents = lens.undistort_tangents(arcs.xy, arcs.tangents)

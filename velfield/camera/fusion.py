@@ -94,15 +94,7 @@ class _Estimates:
 
 
 def refine_lens(record: CameraRecord, pairs: FramePairs | None) -> CameraRecord:
-    """The record with the lens refined by frame pairs, or unchanged, and the reason.
-
-    Parameters
-    ----------
-    record
-        Result of the plumb line.
-    pairs
-        Matched points of frame pairs; None: no two frames match.
-    """
+    """The plumb line's record with the lens refined by frame pairs (None: none match), or unchanged, and the reason."""
     plumb_line = _plumb_line_estimate(record)
     evidence = _describe_pairs(pairs, plumb_line)
     if pairs is None or evidence.frames < MIN_FRAMES or evidence.pairs < MIN_PAIRS:

@@ -112,10 +112,8 @@ class _Radial:
 
     Attributes
     ----------
-    centre_x_px, centre_y_px
-        Centre of distortion, raw px; a fixed point.
-    half_diagonal_px
-        Unit of the radius, px.
+    centre_x_px, centre_y_px : centre of distortion, raw px; a fixed point.
+    half_diagonal_px : unit of the radius, px.
     """
 
     centre_x_px: float
@@ -164,16 +162,7 @@ class _Radial:
 class HarrisLens(_Radial):
     """Harris' model, r_d = r / sqrt(1 + a r^2), with its closed inverse r = r_d / sqrt(1 - a r_d^2).
 
-    Parameters
-    ----------
-    a
-        Distortion, in 1 / half-diagonal^2: positive is barrel, zero a pinhole camera.
-
-    Examples
-    --------
-    >>> lens = HarrisLens(a=0.19, centre_x_px=0.0, centre_y_px=0.0, half_diagonal_px=100.0)
-    >>> lens.undistort_points(np.array([[100.0, 0.0]])).round(3)
-    array([[111.111,   0.   ]])
+    The distortion a is in 1 / half-diagonal^2: positive is barrel, zero a pinhole camera.
     """
 
     a: float
@@ -204,16 +193,7 @@ class HarrisLens(_Radial):
 class DivisionLens(_Radial):
     """Division model, r = r_d / (1 - k r_d^2), with its closed inverse: one parameter, for wide-angle lenses.
 
-    Parameters
-    ----------
-    k
-        Distortion, in 1 / half-diagonal^2: positive is barrel.
-
-    Examples
-    --------
-    >>> lens = DivisionLens(k=0.2, centre_x_px=0.0, centre_y_px=0.0, half_diagonal_px=100.0)
-    >>> lens.distort_points(lens.undistort_points(np.array([[100.0, 0.0]])))
-    array([[100.,   0.]])
+    The distortion k is in 1 / half-diagonal^2: positive is barrel.
     """
 
     k: float
@@ -253,14 +233,7 @@ def _fold_radius(coefficients: tuple[float, ...]) -> float:
 class PolynomialLens(_Radial):
     """Polynomial model, r = r_d (1 + k_1 r_d^2 + k_2 r_d^4 + ...), for lenses that one parameter cannot describe.
 
-    Parameters
-    ----------
-    coefficients
-        k_1, k_2, ..., with the radius in half-diagonals.
-
-    Notes
-    -----
-    The inverse is that of the branch about the centre, up to the radius where the model folds.
+    The radius is in half-diagonals. The inverse is that of the branch about the centre, up to where the model folds.
     """
 
     coefficients: tuple[float, ...]
@@ -316,13 +289,7 @@ class PolynomialLens(_Radial):
 
 
 def pinhole(frame_shape: tuple[int, int]) -> HarrisLens:
-    """The lens without distortion for frames of (height, width): the identity.
-
-    Examples
-    --------
-    >>> pinhole((3, 5)).centre_x_px
-    2.0
-    """
+    """The lens without distortion for frames of (height, width): the identity."""
     height, width = frame_shape
     return HarrisLens(
         a=0.0,

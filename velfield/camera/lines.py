@@ -49,6 +49,16 @@ def fit_lines(xy: FloatArray, line: IntArray, count: int) -> tuple[FloatArray, F
     return mean, np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
+def _fit_segments(xy: FloatArray, line: IntArray, count: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """As `fit_lines`, and where each group begins and ends along its line, from its mean (count,)."""
+    mean, direction = fit_lines(xy, line, count)
+    along = np.sum((xy - mean[line]) * direction[line], axis=1)
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, line, along)
+    np.maximum.at(high, line, along)
+    return mean, direction, low, high
+
+
 def line_residuals(lines: LineSet, lens: Lens) -> FloatArray:
     """Signed distance of each point from its straight line, (n,) raw px; NaN outside the lens's domain.
 
@@ -71,37 +81,15 @@ def line_rms(lines: LineSet, residuals: FloatArray) -> FloatArray:
 def merge_collinear_arcs(
     arcs: Arcs, lens: Lens, *, tolerance_px: float, max_angle_rad: float, min_length_px: float
 ) -> LineSet:
-    """Group arcs that are collinear under a lens.
+    """Group arcs that are collinear under a lens; shorter lines are dropped.
 
-    Parameters
-    ----------
-    arcs
-        Arcs of all frames.
-    lens
-        The lens under which they are to be collinear.
-    tolerance_px
-        Largest distance of the shorter arc's ends from the extended line of the longer one.
-    max_angle_rad
-        Largest angle between two arcs of a line.
-    min_length_px
-        Shorter lines are dropped.
+    ``tolerance_px`` limits the distance of the shorter arc's ends from the extended line of the longer one.
     """
     xy = lens.undistort_points(arcs.xy)
+    inside = np.bincount(arcs.arc, weights=~np.isfinite(xy[:, 0]), minlength=arcs.length_px.size) == 0
+    arcs, xy = arcs.select(inside), xy[inside[arcs.arc]]
     count = int(arcs.length_px.size)
-    outside = np.bincount(arcs.arc, weights=~np.isfinite(xy[:, 0]), minlength=count) > 0
-    if outside.any():
-        return merge_collinear_arcs(
-            arcs.select(~outside),
-            lens,
-            tolerance_px=tolerance_px,
-            max_angle_rad=max_angle_rad,
-            min_length_px=min_length_px,
-        )
-    mean, direction = fit_lines(xy, arcs.arc, count)
-    along = np.sum((xy - mean[arcs.arc]) * direction[arcs.arc], axis=1)
-    low, high = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(low, arcs.arc, along)
-    np.maximum.at(high, arcs.arc, along)
+    mean, direction, low, high = _fit_segments(xy, arcs.arc, count)
     pairs = [
         _collinear_pairs(np.flatnonzero(arcs.frame == frame), mean, direction, low, high, tolerance_px, max_angle_rad)
         for frame in np.unique(arcs.frame)
@@ -144,9 +132,5 @@ def _collinear_pairs(
 
 def chord_lengths(lines: LineSet) -> FloatArray:
     """Extent of each line along its direction, raw px."""
-    mean, direction = fit_lines(lines.xy, lines.line, lines.count)
-    along = np.sum((lines.xy - mean[lines.line]) * direction[lines.line], axis=1)
-    low, high = np.full(lines.count, np.inf), np.full(lines.count, -np.inf)
-    np.minimum.at(low, lines.line, along)
-    np.maximum.at(high, lines.line, along)
-    return np.asarray(high - low)
+    _, _, low, high = _fit_segments(lines.xy, lines.line, lines.count)
+    return high - low

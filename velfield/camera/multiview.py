@@ -86,6 +86,11 @@ class _State:
     shared: FloatArray
     matrices: FloatArray
 
+    def move(self, step: FloatArray | float, change: FloatArray) -> "_State":
+        """After a step of the shared parameters and a change (pairs, 8) of the homographies' free elements."""
+        last = np.zeros((len(change), 1))
+        return _State(self.shared + step, self.matrices + np.concatenate([change, last], axis=1).reshape(-1, 3, 3))
+
 
 @dataclass(frozen=True)
 class _Problem:
@@ -237,12 +242,6 @@ def _linearise(problem: _Problem, state: _State) -> _ReducedEquations:
     )
 
 
-def _apply_step(state: _State, equations: _ReducedEquations, step: FloatArray) -> _State:
-    change = equations.own - (equations.coupling @ step[equations.indices][..., None])[..., 0]
-    change = np.concatenate([change, np.zeros((len(change), 1))], axis=1)
-    return _State(state.shared + step, state.matrices + change.reshape(-1, 3, 3))
-
-
 def _homography_jacobian(problem: _Problem, state: _State, distortion: FloatArray) -> FloatArray:
     """(pairs, n, 2, 8): raw px with respect to the eight free elements of each pair's homography."""
     lens = problem.family.lens(state.shared)
@@ -336,18 +335,9 @@ def _chain_homographies(pairs: FramePairs, matrices: FloatArray) -> FloatArray:
 
 
 def fit_multiview(pairs: FramePairs, family: ScaledLens, *, start: float | None, before: float) -> MultiViewFit:
-    """Estimate the amount of distortion from frame pairs.
+    """Estimate the amount of distortion from frame pairs, with outliers among their points.
 
-    Parameters
-    ----------
-    pairs
-        Matched points, outliers among them.
-    family
-        The lenses to choose from.
-    start
-        Initial amount; None: the best of a grid.
-    before
-        Amount of the previous lens, with which the estimate is compared.
+    ``start`` is the initial amount, None the best of a grid; the estimate is compared with the amount ``before``.
     """
     problem, state = min(
         (_fit_from_start(pairs, family, amount) for amount in (_START_AMOUNTS if start is None else (start,))),
@@ -411,7 +401,8 @@ def _iterate(problem: _Problem, state: _State, steps: int) -> _State:
         equations = _linearise(problem, state)
         step = equations.step(problem, state.shared)
         step *= min(1.0, _MAX_STEP / max(abs(float(step[0])), 1e-12))
-        state = _apply_step(state, equations, step)
+        change = equations.own - (equations.coupling @ step[equations.indices][..., None])[..., 0]
+        state = state.move(step, change)
         if abs(float(step[0])) < _CONVERGED_STEP:
             break
     return state
@@ -451,6 +442,5 @@ def _refit_homographies(problem: _Problem, lens: FloatArray, matrices: FloatArra
             normal + 1e-9 * (1.0 + np.trace(normal, axis1=1, axis2=2)[:, None, None]) * np.eye(8),
             weighted.transpose(0, 2, 1) @ _zero_invalid(residuals).reshape(len(residuals), -1, 1),
         )
-        change = np.concatenate([change[..., 0], np.zeros((len(change), 1))], axis=1)
-        state = _State(shared, state.matrices + change.reshape(-1, 3, 3))
+        state = state.move(0.0, change[..., 0])
     return _medians(problem.residuals(state), problem.pairs.valid)

@@ -1,14 +1,11 @@
 """Lens calibration from the straight lines of the scene (paper: camera calibration, the plumb line).
 
-1. Edge points of several frames are detected and linked into smooth arcs (`edges`).
-2. The entropy of the lines' angles and distances (`entropy`) is minimised: a grid over the distortion, then a simplex
-   descent with the centre free. Without the grid the descent ends in local minima.
-3. Collinear arcs are merged (`lines`) and the lens is fitted to subpixel accuracy by the straightness of the lines
+1. Edge points of several frames are linked into smooth arcs (`edges`), and the entropy of their angles and distances
+   (`entropy`) is minimised: a grid over the distortion, without which the descent after it ends in local minima.
+2. Collinear arcs are merged (`lines`) and the lens is fitted to subpixel accuracy by the straightness of the lines
    (`straighten`): Harris' model, the division model, polynomials of two and three terms, selected by cross-validation.
-4. The fit is refined by the vanishing points of families of parallel lines (`vanishing_points`).
-5. The distortion is tested for significance, because cities have curved kerbs and few lines fit any lens. It is
-   accepted if it lowers the entropy, exceeds five standard deviations, is consistent between arcs before merging, lines
-   merged under the pinhole model and lines merged under the lens, and straightens most of the lines that it changes.
+3. The fit is refined by the vanishing points of families of parallel lines (`vanishing_points`).
+4. The distortion is tested for significance (`_decide`), because cities have curved kerbs and few lines fit any lens.
    Otherwise the pinhole model is kept, and the reason is given.
 """
 
@@ -21,7 +18,7 @@ from scipy.optimize import minimize
 from schemas.arrays import FloatArray, GreyImage
 from schemas.camera import CameraRecord, ModelEvidence
 from schemas.flight import LensConfig
-from velfield.camera.edges import Arcs, detect_arcs_of_frames, pool_arcs
+from velfield.camera.edges import Arcs, detect_and_pool_arcs
 from velfield.camera.entropy import hough_entropy
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.camera.lines import LineSet, line_residuals, line_rms, merge_collinear_arcs
@@ -56,7 +53,7 @@ _GRID_STEP = 0.05
 _DISTANCE_BIN_PX = 2.0
 _SEARCH_POINTS = 12_000
 _MAX_ANGLE_RAD = 0.03
-_ARC_FRACTION, _LINE_FRACTION = 0.012, 0.04  # of the diagonal: the shortest arc, the shortest line
+_LINE_FRACTION = 0.04  # of the diagonal: the shortest line
 _FOLDS = 4
 _MIN_CHANGE_PX = 0.05
 _ALLOWED_SIGMAS = 2.0
@@ -113,7 +110,7 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
         No frames, or frames of different sizes.
     """
     shape = _common_shape(frames)
-    data = _EdgeData(shape, _detect_and_pool(frames, shape, config), config.angle_bins)
+    data = _EdgeData(shape, detect_and_pool_arcs(frames, max_points=config.max_edge_points), config.angle_bins)
     count = data.arcs.length_px.size
     if count < MIN_LINES:
         reason = f"{count} straight edges in {len(frames)} frames, {MIN_LINES} needed"
@@ -177,16 +174,6 @@ def _common_shape(frames: Sequence[GreyImage]) -> tuple[int, int]:
                 "all must be grey images of one size"
             )
     return height, width
-
-
-def _detect_and_pool(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig) -> Arcs:
-    half_diagonal = pinhole(shape).half_diagonal_px
-    parts = detect_arcs_of_frames(
-        frames,
-        min_length_px=max(24.0, _ARC_FRACTION * 2.0 * half_diagonal),
-        max_curvature_per_px=2.0 / half_diagonal,
-    )
-    return pool_arcs(parts, max_points=config.max_edge_points)
 
 
 def _search_distortion(data: _EdgeData, max_distortion: float) -> tuple[FloatArray, FloatArray, FloatArray]:

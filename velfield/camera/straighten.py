@@ -81,22 +81,7 @@ def geman_mcclure_weights(residuals: FloatArray, scale: float | FloatArray) -> F
 
 
 def fit_lens(lines: LineSet, family: LensFamily, start: FloatArray) -> PlumbLineFit:
-    """Fit a model's parameters to straight lines.
-
-    Parameters
-    ----------
-    lines
-        Points of lines.
-    family
-        The model.
-    start
-        Initial parameters, (terms + 2,).
-
-    Returns
-    -------
-    PlumbLineFit
-        Its covariance is the sandwich estimate clustered by line.
-    """
+    """Fit a model to straight lines from initial parameters (terms + 2,); the covariance is clustered by line."""
     parameters, damping = _shrink_into_domain(lines, family, start), 1e-3
     sizes = np.bincount(lines.line, minlength=lines.count).astype(np.float64)
     residuals = line_residuals(lines, family.lens(parameters))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from schemas.arrays import FloatArray, GreyImage, IntArray
-from velfield.camera.edges import Arcs, detect_arcs_of_frames, pool_arcs
+from velfield.camera.edges import Arcs, detect_and_pool_arcs
 from velfield.camera.entropy import entropy_nats, linear_bin_weights
 from velfield.camera.lens import Lens
 
@@ -34,7 +34,6 @@ _GRID = (0.15, 0.3, 0.45, 0.6)
 _DIRECTIONS = 16
 _MIN_DEPTH = 0.15
 _MAX_POINTS = 20_000
-_ARC_FRACTION, _MAX_CURVATURE = 0.012, 4.0  # of the diagonal; over the diagonal
 FOCAL_HALF_DIAGONALS = 2.0
 """Focal length of a usual drone camera, half-diagonals: 1.25 widths of a frame of 4 : 3."""
 
@@ -67,13 +66,7 @@ class Tilt:
 def tilt_of_frames(frames: Sequence[GreyImage], lens: Lens) -> Tilt | None:
     """Estimate the perspective of the ground from frames (h, w) uint8 of one camera; None: they show too few lines."""
     shape = (frames[0].shape[0], frames[0].shape[1])
-    diagonal_px = float(np.hypot(*shape))
-    parts = detect_arcs_of_frames(
-        frames,
-        min_length_px=max(24.0, _ARC_FRACTION * diagonal_px),
-        max_curvature_per_px=_MAX_CURVATURE / diagonal_px,
-    )
-    return estimate_tilt(pool_arcs(parts, max_points=_MAX_POINTS), lens, shape)
+    return estimate_tilt(detect_and_pool_arcs(frames, max_points=_MAX_POINTS), lens, shape)
 
 
 def estimate_tilt(arcs: Arcs, lens: Lens, shape: tuple[int, int]) -> Tilt | None:

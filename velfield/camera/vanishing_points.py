@@ -79,20 +79,8 @@ class _FamilyEquations:
 def refine_by_vanishing_points(fit: PlumbLineFit, lines: LineSet, seed: int = 0) -> PlumbLineFit:
     """Combine a plumb-line fit, as a Gaussian prior, with the vanishing points of families of parallel lines.
 
-    Parameters
-    ----------
-    fit
-        The plumb-line fit; its covariance is that of the prior.
-    lines
-        The lines it was fitted to.
-    seed
-        Seed of the random pairs of lines whose intersections are tried as vanishing points.
-
-    Returns
-    -------
-    PlumbLineFit
-        Unchanged if no frame has a family, if the plumb line is more accurate than parallels can be, or if the model's
-        domain would end within the image.
+    The fit is unchanged if no frame has a family, if the plumb line is more accurate than parallels can be, or if the
+    model's domain would end within the image. The seed is that of the pairs of lines whose intersections are tried.
     """
     if float(np.sqrt(fit.covariance[0, 0])) < MIN_RELATIVE_SD * abs(float(fit.parameters[0])):
         return fit
@@ -101,8 +89,10 @@ def refine_by_vanishing_points(fit: PlumbLineFit, lines: LineSet, seed: int = 0)
         return fit
     prior = np.linalg.inv(fit.covariance)
     parameters, information = fit.parameters, np.zeros_like(prior)
+    shifts = np.vstack([np.zeros(parameters.size), _DIFFERENCE * np.eye(parameters.size)])
     for _ in range(_ITERATIONS):
-        equations = _linearise_families(lines, fit, parameters, families)
+        current, *shifted = (_undistort_lines(lines, fit, parameters + shift) for shift in shifts)
+        equations = [_linearise(family, current, shifted) for family in families]
         information = np.sum([part.normal for part in equations], axis=0)
         right = prior @ (fit.parameters - parameters) + sum(part.right for part in equations)
         step = np.linalg.solve(prior + information, right)
@@ -162,15 +152,6 @@ def _intersections(undistorted: _UndistortedLines, pairs: IntArray) -> FloatArra
     size = np.linalg.norm(points, axis=1)
     distinct = size > 1e-9  # a line intersects itself everywhere
     return np.asarray(points[distinct] / size[distinct, None])
-
-
-def _linearise_families(
-    lines: LineSet, fit: PlumbLineFit, parameters: FloatArray, families: list[_Family]
-) -> list[_FamilyEquations]:
-    current = _undistort_lines(lines, fit, parameters)
-    shifts = _DIFFERENCE * np.eye(parameters.size)
-    shifted = [_undistort_lines(lines, fit, parameters + shift) for shift in shifts]
-    return [_linearise(family, current, shifted) for family in families]
 
 
 def _linearise(family: _Family, current: _UndistortedLines, shifted: list[_UndistortedLines]) -> _FamilyEquations:

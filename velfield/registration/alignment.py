@@ -86,20 +86,10 @@ def make_templates(
     exclude: FloatArray | None = None,
     half_patch: int = HALF_PATCH,
 ) -> Templates:
-    """Detect the strongest corner (Shi-Tomasi) of each of about ``count`` cells of a base image (h, w).
+    """Detect the strongest corner (Shi-Tomasi) of each of about ``count`` cells of a base image (h, w) uint8.
 
-    Parameters
-    ----------
-    base
-        (h, w) uint8.
-    mask
-        (h, w) bool: where the base image is valid; None: everywhere.
-    count
-        Number of cells.
-    exclude
-        (n, 2) px: no corner lies within `HALF_PATCH` of these.
-    half_patch
-        px from a corner to its patch's edge. Larger patches are less sensitive to noise, but span more relief.
+    It is valid in ``mask`` (h, w) bool, None: everywhere. No corner lies within `HALF_PATCH` of the points ``exclude``
+    (n, 2). Larger patches, ``half_patch`` px to every side, are less sensitive to noise, but span more relief.
     """
     return make_template_sets(base, mask, counts=(count,), exclude=exclude, half_patch=half_patch)[0]
 
@@ -178,22 +168,8 @@ def align_patches(
 ) -> tuple[ControlPoints, int]:
     """Locate the patches of the base image in a raw frame, starting from where ``transform`` maps them.
 
-    Parameters
-    ----------
-    image
-        (h, w), the raw frame blurred by `smooth_fine` and, if ``coarse``, by `smooth_coarse` after it.
-    transform
-        The frame's map so far, accurate to about ``max_shift_px``.
-    templates
-        Patches of the base image.
-    coarse
-        Whether ``image`` is the coarse level.
-    max_shift_px
-        Patches that move farther are rejected, base px.
-
-    Returns
-    -------
-    Control points, and the number of patches that lie in the frame.
+    The image (h, w) is the frame blurred by `smooth_fine` and, if ``coarse``, by `smooth_coarse` after it. Patches that
+    move by more than ``max_shift_px``, base px, are rejected. Also the number of patches that lie in the frame.
     """
     start, derivative = transform.to_raw_in_frame(templates.xy)
     spacing = _COARSE_SPACING_PX if coarse else 1

@@ -18,14 +18,8 @@ _TILE_PX = 512
 
 
 def median_of_stack(stack: ByteArray, count: ByteArray) -> GreyImage:
-    """The median of each pixel over the frames that cover it, (h, w) uint8, halves rounded up; 0 where none does.
-
-    Parameters
-    ----------
-    stack
-        Frames (n, h, w) uint8 on a common grid, `NOT_COVERED` where a frame does not cover it.
-    count
-        Number of frames that cover each pixel, (h, w).
+    """The median of each pixel over the ``count`` (h, w) frames that cover it, (h, w) uint8, halves rounded up; 0 where
+    none does. The stack (n, h, w) uint8 of frames on a common grid is `NOT_COVERED` where a frame does not cover it.
     """
     median = np.zeros(count.shape, np.uint8)
     _medians(stack, count, _comparisons(len(stack)), median)

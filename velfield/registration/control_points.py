@@ -49,9 +49,9 @@ def rms(vectors: FloatArray) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean())) if len(vectors) else float("nan")
 
 
-def assign_folds(xy_raw: FloatArray) -> IntArray:
+def assign_folds(xy_raw: FloatArray, cell_px: float = FOLD_CELL_PX) -> IntArray:
     """Fold (n,) of each raw point, by its cell alone: independent of the other points."""
-    cell = np.floor(np.asarray(xy_raw) / FOLD_CELL_PX).astype(np.int64)
+    cell = np.floor(np.asarray(xy_raw) / cell_px).astype(np.int64)
     return np.asarray((cell[:, 0] * 2 + cell[:, 1]) % FOLDS)
 
 

@@ -267,14 +267,9 @@ def predict_change(undistorted, corrected, first, basis, step, fold, knots, coef
 def eliminate_bands(bands: FloatArray, border: FloatArray, corner: FloatArray) -> None:
     """Eliminate the unknowns of eight symmetric systems at once, value by value: in place, without a root.
 
-    Parameters
-    ----------
-    bands
-        (n, width, 8): ``bands[i, d]`` is the matrix's value of unknowns i and i + d.
-    border
-        (n, m, 8) products with further unknowns, and behind them right-hand sides.
-    corner
-        (k, m, 8), k <= m: those of the further unknowns, of which the upper triangle is read and written.
+    ``bands`` (n, width, 8): ``bands[i, d]`` is the matrix's value of unknowns i and i + d. ``border`` (n, m, 8) has
+    products with further unknowns, and behind them right-hand sides, ``corner`` (k, m, 8), k <= m, those of the further
+    unknowns, of which the upper triangle is read and written.
     """
     size, width, columns = bands.shape[0], bands.shape[1], border.shape[1]
     inverse = np.empty(LANES)
@@ -380,16 +375,9 @@ def solve_steps(bands, border, corner, stiffness, gauge, gauge_weight, prior, fr
     multiplier for each of its directions, which are further unknowns as the 17 parameters are: their equations read
     gauge . x = multiplier / gauge_weight.
 
-    Parameters
-    ----------
-    bands, border, corner
-        From `normal_equations`, of at most eight folds where each is left out.
-    stiffness
-        (3 knots, 3) penalty of each row coefficient with itself and those of the next two knots.
-    gauge
-        (3 knots, g) directions.
-    prior, free
-        (17,) penalty of the other parameters, and whether each is free.
+    The equations are from `normal_equations`, of at most eight folds where each is left out. ``stiffness`` (3 knots, 3)
+    is the penalty of each row coefficient with itself and those of the next two knots, ``gauge`` (3 knots, g) has the
+    directions, ``prior`` and ``free`` (17,) the penalty of the other parameters, and whether each is free.
     """
     matrix, beside, inner = _make_priors(stiffness, gauge, gauge_weight, prior, theta)
     directions = gauge.shape[1]

@@ -21,8 +21,8 @@ from velfield.registration.transforms import PolyprojectiveTransform, as_points,
 
 Model = Literal["polyprojective", "homography"]
 
-N_FREE_PARAMETERS = {"homography": 8, "polyprojective": 17}
-"""Free parameters of each model."""
+_FREE = {"homography": np.array([0, 1, 2, 6, 7, 8, 12, 13]), "polyprojective": np.arange(17)}
+"""Indices of each model's free parameters among the 17 (a, b: 6 each; c without its leading 1: 5)."""
 
 _MAX_STEPS = 30
 _MIN_RELATIVE_DECREASE = 1e-4  # of the cost: convergence
@@ -53,13 +53,6 @@ def second_order_monomials(xy: FloatArray, norm: FloatArray) -> FloatArray:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
-def _free_parameters(model: Model) -> IntArray:
-    """Indices of the model's free parameters among the 17 (a, b: 6 each; c without its leading 1: 5)."""
-    if model == "polyprojective":
-        return np.arange(17)
-    return np.array([0, 1, 2, 6, 7, 8, 12, 13])
-
-
 def _unpack(parameters: FloatArray) -> FloatArray:
     return np.stack([parameters[:6], parameters[6:12], np.concatenate([[1.0], parameters[12:]])])
 
@@ -74,33 +67,21 @@ def _design_matrix(m: FloatArray, target: FloatArray, denominator: FloatArray) -
 
 
 def fit_polyprojective(
-    source: FloatArray,
-    target: FloatArray,
-    *,
-    model: Model = "polyprojective",
+    source: FloatArray, target: FloatArray, *, model: Model = "polyprojective"
 ) -> PolyprojectiveTransform | Failure:
-    """Minimise the squares of target - map(source): linear homography, then Levenberg-Marquardt.
+    """Minimise the squares of target - map(source), points (n, 2) px: linear homography, then Levenberg-Marquardt.
 
-    Parameters
-    ----------
-    source, target
-        Points (n, 2), px.
-    model
-        ``homography`` keeps the second-order terms zero.
-
-    Returns
-    -------
-    The map, or a failure: too few points, a degenerate configuration, or a denominator that changes sign.
+    A failure: too few points, a degenerate configuration, or a denominator that changes sign.
     """
     source, target = as_points(source), as_points(target)
-    needed = N_FREE_PARAMETERS[model] // 2 + 1
+    needed = len(_FREE[model]) // 2 + 1
     if len(source) < needed:
         return Failure(f"{len(source)} control points, a {model} needs {needed}")
     source_norm, target_norm = fit_normalisation(source), fit_normalisation(target)
     m = second_order_monomials(source, source_norm)
     target_normalised = (target - target_norm[:2]) * target_norm[2]
     parameters = _fit_linear_homography(m, target_normalised)
-    fitted = _levenberg_marquardt(parameters, m, target_normalised, _free_parameters(model))
+    fitted = _levenberg_marquardt(parameters, m, target_normalised, _FREE[model])
     if fitted is None:
         return Failure(f"the {model} has a pole among the control points")
     if not np.isfinite(fitted).all():
@@ -110,7 +91,7 @@ def fit_polyprojective(
 
 def _fit_linear_homography(m: FloatArray, target_normalised: FloatArray) -> FloatArray:
     """The 17 parameters of the homography of minimum algebraic error (DLT): initial value of the refinement."""
-    columns = _free_parameters("homography")
+    columns = _FREE["homography"]
     design = _design_matrix(m, target_normalised, np.ones(len(m)))[:, columns]
     parameters = np.zeros(17)
     parameters[columns] = _solve_normal_equations(design, target_normalised.T.ravel())
@@ -182,18 +163,8 @@ def fit_by_case_deletion(
 ) -> CaseDeletionFit | Failure:
     """Robust fit by case deletion: fit, drop the worst fraction, repeat until the mean error is below the limit.
 
-    Paper: registration, 5 % per round until the mean error is below 2 px.
-
-    Parameters
-    ----------
-    source, target
-        Control points (n, 2), px.
-    drop_fraction
-        Fraction of the remaining points that a round drops, at least one.
-    max_mean_error_px
-        Mean error at which deletion ends.
-    min_control_points
-        With fewer points remaining, the fit is a failure.
+    Paper: registration, 5 % per round until the mean error is below 2 px. Each round drops one point (n, 2) at least; a
+    failure if fewer than ``min_control_points`` remain.
     """
     source, target = as_points(source), as_points(target)
     inliers: Mask = np.asarray(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))

@@ -15,7 +15,7 @@ from velfield.registration.control_points import ControlPoints, is_inlier, rms
 from velfield.registration.fitting import fit_by_case_deletion
 from velfield.registration.joint import JointFit, fit_jointly
 from velfield.registration.keypoints import Keypoints
-from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh, measure_support
+from velfield.registration.mesh import MESH_ITERATIONS, cell_index, fit_robust_mesh, measure_support
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, count_row_knots
 
 QUALITY_CELLS = (6, 8)
@@ -315,23 +315,16 @@ class FrameFitter:
         )
 
 
-def _cell_index(xy_raw: FloatArray, width: int, height: int) -> IntArray:
-    rows, columns = QUALITY_CELLS
-    row = np.clip((xy_raw[:, 1] + 0.5) / height * rows, 0, rows - 1).astype(np.int64)
-    column = np.clip((xy_raw[:, 0] + 0.5) / width * columns, 0, columns - 1).astype(np.int64)
-    return np.asarray(row * columns + column)
-
-
 def select_in_empty_cells(points: ControlPoints, aligned: ControlPoints, width: int, height: int) -> ControlPoints:
     """Select the control points of ``points`` in the cells of the frame where ``aligned`` has none."""
     empty = np.ones(QUALITY_CELLS[0] * QUALITY_CELLS[1], bool)
-    empty[_cell_index(aligned.xy_raw, width, height)] = False
-    return points.select(empty[_cell_index(points.xy_raw, width, height)])
+    empty[cell_index(aligned.xy_raw, QUALITY_CELLS, width, height)] = False
+    return points.select(empty[cell_index(points.xy_raw, QUALITY_CELLS, width, height)])
 
 
 def _cell_rms(xy_raw: FloatArray, errors: FloatArray, width: int, height: int) -> FloatArray:
     rows, columns = QUALITY_CELLS
-    cell = _cell_index(xy_raw, width, height)
+    cell = cell_index(xy_raw, QUALITY_CELLS, width, height)
     squares = np.bincount(cell, (errors**2).sum(axis=1), rows * columns)
     counts = np.bincount(cell, minlength=rows * columns)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,24 +1,21 @@
 """Intra-sensor registration: every frame to the base image of the same camera, and to the frame before it.
 
-Paper: intra-sensor registration. The first frame of a chain, and every one that the
-way below loses, goes through these steps:
+Paper: intra-sensor registration. The first frame of a chain, and every one that the way below loses, goes through
+these steps:
 
-1. a prior homography from the base image (SIFT keypoints, ratio test, MAGSAC), which needs no other frame; if it fails,
-   from the keypoints of the previous registered frame, mapped through its transform;
+1. a prior homography from the base image (SIFT keypoints, MAGSAC); if it fails, from the previous registered frame;
 2. guided matching of the keypoints in a window about the prior, to the base image and to the previous frame;
 3. the fit, by ``model``: the joint robust fit of polyprojective and row spline (`velfield.registration.joint`, the
    default), a homography fitted in the same way, or with ``model="polyprojective"`` the paper's, by case deletion
    (`velfield.registration.fitting`), after which there is no step 4;
 4. subpixel alignment of patches of the base image through that map, and the fit again, twice;
-5. the displacement mesh, if cross-validation supports one; its cells are 120 px by default, the paper's 200
-   (``cell_size_px``).
+5. the displacement mesh, if cross-validation supports one.
 
-Every other frame, and the first where it follows a known one, starts from the one before (``start="optical_flow"``):
-the inliers of that frame are tracked into this one by pyramidal Lucas-Kanade, a fit to them takes the place of steps 1
-to 3, and steps 4 and 5 follow. Nothing of the earlier frame's error remains: only patches that are aligned to the base
-image itself are fitted and counted.
-Keypoints cost more than all else of a frame's registration. A frame that comes out worse than the one that its chain
-began with, or as the first in fewer than half of its cells, is registered again by its keypoints.
+Every other frame, and the first where it follows a known one, starts from the one before (``start="optical_flow"``),
+since keypoints cost more than all else: the inliers of that frame are tracked into this one by pyramidal Lucas-Kanade,
+a fit to them takes the place of steps 1 to 3, and steps 4 and 5 follow. Nothing of the earlier frame's error remains:
+only patches that are aligned to the base image itself are fitted and counted. A frame that comes out worse than the one
+that its chain began with, or as the first in fewer than half of its cells, is registered again by its keypoints.
 
 Matches to the previous frame propagate its errors and would let the chain drift: they are used only in those cells of
 the frame where the base image gives no match. Where the base image covers the frame, the result does not depend on
@@ -83,18 +80,9 @@ def prepare_base(
     mask: Mask | None = None,
     frame_shape: tuple[int, int] | None = None,
 ) -> BaseReference:
-    """Find the patches of a base image; its keypoints are detected when they are first asked for.
+    """Find the patches of a base image (h, w) uint8; its keypoints are detected when they are first asked for.
 
-    Parameters
-    ----------
-    grey
-        (h, w) uint8.
-    config
-        The registration section of the flight's configuration.
-    mask
-        (h, w) bool: where the base image is valid; None: everywhere.
-    frame_shape
-        (height, width) of the frames: a base image larger than a frame keeps more keypoints.
+    It is valid in ``mask`` (h, w) bool, None everywhere; one larger than frames of (height, width) keeps more of them.
     """
     frame_area = grey.size if frame_shape is None else frame_shape[0] * frame_shape[1]
     ratio = float(np.clip(grey.size / frame_area, 1.0, _MAX_BASE_KEYPOINT_RATIO))
@@ -112,12 +100,8 @@ def register_chain(
 ) -> list[FrameRegistration]:
     """Register a chain of frames in the order of time, or against it; results in the order of the frames.
 
-    Parameters
-    ----------
-    frames
-        (index, grey (h, w) uint8, function that detects its keypoints in raw px) of each.
-    before
-        A frame of known map from which optical flow may start the first; its keypoints are not used.
+    Each is (index, grey (h, w) uint8, function that detects its keypoints in raw px). From ``before``, a frame of known
+    map, optical flow may start the first; its keypoints are not used.
     """
     results: list[FrameRegistration] = []
     by_flow = config.start == "optical_flow" and config.model != "polyprojective"
@@ -283,25 +267,9 @@ def register_frame(
     config: RegistrationConfig,
     previous: Keypoints | None = None,
 ) -> FrameRegistration:
-    """Register one frame.
+    """Register one raw frame (h, w) uint8 by its keypoints, raw px, and those of the previous registered one, base px.
 
-    Parameters
-    ----------
-    grey
-        (h, w) uint8, raw.
-    keypoints
-        Its keypoints, raw px.
-    base
-        Base image, from `prepare_base`.
-    lens, config
-        The camera's lens and the registration section of the configuration.
-    previous
-        Keypoints of the previous registered frame, base px; None: there is none.
-
-    Returns
-    -------
-    FrameRegistration
-        If it failed: no transform, and the reason in ``status``.
+    If it failed, the result has no transform, and the reason in ``status``.
     """
     undistorted = as_points(lens.undistort_points(keypoints.xy))
     prior = _estimate_prior(undistorted, keypoints, base, previous)
@@ -330,18 +298,16 @@ def _estimate_prior(
 ) -> HomographyTransform | Failure:
     """The prior homography: from the base image, else from the previous frame."""
     direct = estimate_homography_prior(undistorted, keypoints.descriptors, base.keypoints)
-    if direct or previous is None:
-        return direct if direct else Failure(f"no prior from the base image ({_reason(direct)})")
+    if not isinstance(direct, Failure):
+        return direct
+    if previous is None:
+        return Failure(f"no prior from the base image ({direct.reason})")
     chained = estimate_homography_prior(undistorted, keypoints.descriptors, previous)
-    if chained:
+    if not isinstance(chained, Failure):
         return chained
     return Failure(
-        f"no prior, neither from the base image ({_reason(direct)}) nor from the previous frame ({_reason(chained)})"
+        f"no prior, neither from the base image ({direct.reason}) nor from the previous frame ({chained.reason})"
     )
-
-
-def _reason(result: object) -> str:
-    return result.reason if isinstance(result, Failure) else ""
 
 
 def _match_control_points(

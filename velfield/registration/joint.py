@@ -32,7 +32,6 @@ from velfield.registration.control_points import (
     finite_median,
     geman_mcclure,
     is_inlier,
-    rms,
 )
 from velfield.registration.transforms import (
     FrameTransform,
@@ -99,16 +98,6 @@ class JointFit:
     def inliers(self) -> Mask:
         """(n,) control points of sufficient weight."""
         return is_inlier(self.weights)
-
-    @property
-    def residual_px(self) -> float:
-        """RMS residual of the inliers."""
-        return rms(self.residuals[self.inliers])
-
-    @property
-    def cv_error_px(self) -> float:
-        """RMS cross-validated residual of the inliers."""
-        return rms(self.cv_residuals[self.inliers])
 
 
 _Equations: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
@@ -210,14 +199,12 @@ def fit_jointly(
     ----------
     points
         Control points; up to about half may be outliers.
-    start
-        Undistorted px to base px, accurate to a few times ``start_scale_px``.
+    start, start_rows
+        Undistorted px to base px, accurate to a few times ``start_scale_px``, and (3, knots) row coefficients.
     knots
         Coefficients of the row spline per component; 0: none.
     homography
         Keep the second-order terms zero.
-    start_rows
-        (3, knots) initial row coefficients.
     start_scale_px
         Upper limit of the robust scale: residuals up to some eight times this have weight at first.
     start_stiffness
@@ -229,9 +216,7 @@ def fit_jointly(
     -------
     The fit, or a failure if it does not converge.
     """
-    problem = _build_problem(
-        points, start=start, lens=lens, width=width, height=height, knots=knots, homography=homography
-    )
+    problem = _build_problem(points, lens=lens, width=width, height=height, knots=knots, homography=homography)
     state = problem.evaluate(_initial_parameters(problem, start, start_rows))
     rough = rough and start_stiffness is not None
     fitted = _irls_annealed(problem, state, start_scale_px, start_stiffness, rough=rough)
@@ -242,14 +227,7 @@ def fit_jointly(
 
 
 def _build_problem(
-    points: ControlPoints,
-    *,
-    start: PolyprojectiveTransform,
-    lens: Lens,
-    width: int,
-    height: int,
-    knots: int,
-    homography: bool,
+    points: ControlPoints, *, lens: Lens, width: int, height: int, knots: int, homography: bool
 ) -> _Problem:
     raw = as_points(points.xy_raw)
     undistorted = as_points(lens.undistort_points(raw))

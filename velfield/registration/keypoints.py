@@ -1,12 +1,7 @@
-"""SIFT keypoints of a frame, detected on a downscaled image and distributed evenly over it.
+"""SIFT keypoints of a frame, detected on a downscaled image and distributed evenly over it, and their matches.
 
-Paper: registration (SIFT). Keypoints depend on one frame alone, so frames are processed in parallel. They register a
-frame to about a pixel; `alignment` refines to subpixel accuracy at full resolution.
-
-Descriptor matching: of all keypoints, for a prior homography, and guided, in a window about the predicted position.
-
-Paper: registration; guided matches are searched within 50 x 50 px of the prediction. Both use a ratio test and a
-cross-check.
+Paper: registration (SIFT). Keypoints register a frame to about a pixel; `alignment` refines to subpixel accuracy. All
+are matched for a prior homography; guided matches are searched within 50 x 50 px of the predicted position.
 """
 
 from dataclasses import dataclass
@@ -45,30 +40,13 @@ class Keypoints:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def first(self, count: int) -> "Keypoints":
-        """The first ``count``: the strongest, distributed over the image."""
-        return Keypoints(self.xy[:count], self.descriptors[:count])
-
 
 def detect_keypoints(
-    grey: GreyImage,
-    config: RegistrationConfig,
-    mask: Mask | None = None,
-    *,
-    count: int | None = None,
+    grey: GreyImage, config: RegistrationConfig, mask: Mask | None = None, *, count: int | None = None
 ) -> Keypoints:
-    """Detect SIFT keypoints, the strongest of each cell first.
+    """Detect SIFT keypoints of an image (h, w) uint8, the strongest of each cell first.
 
-    Parameters
-    ----------
-    grey
-        (h, w) uint8.
-    config
-        ``max_keypoints`` and ``keypoint_scale``.
-    mask
-        (h, w) bool: where keypoints are allowed; None: everywhere.
-    count
-        Keypoints kept, in place of ``config.max_keypoints``.
+    They lie where ``mask`` (h, w) bool allows it, None: everywhere; ``count`` replaces ``config.max_keypoints``.
     """
     n_keypoints = config.max_keypoints if count is None else count
     height, width = grey.shape
@@ -164,9 +142,8 @@ def fit_homography(source: FloatArray, target: FloatArray) -> HomographyTransfor
 
 def is_plausible(prior: HomographyTransform, xy: FloatArray) -> bool:
     """Whether the map preserves handedness, with a scale within 6-fold, at points (n, 2)."""
-    step = 1.0
     here = prior(xy)
-    along_x, along_y = prior(xy + np.array([step, 0.0])) - here, prior(xy + np.array([0.0, step])) - here
+    along_x, along_y = prior(xy + np.array([1.0, 0.0])) - here, prior(xy + np.array([0.0, 1.0])) - here
     area = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
     longest = np.maximum(np.linalg.norm(along_x, axis=1), np.linalg.norm(along_y, axis=1))
     with np.errstate(invalid="ignore"):
@@ -174,13 +151,7 @@ def is_plausible(prior: HomographyTransform, xy: FloatArray) -> bool:
 
 
 def match_guided(predicted: FloatArray, descriptors: ByteArray, reference: Keypoints, *, search_px: float) -> Pairs:
-    """Cross-checked matches about the predicted positions (n, 2), base px.
-
-    Parameters
-    ----------
-    search_px
-        Side, not radius, of the square about a predicted position in which its match is searched.
-    """
+    """Cross-checked matches about the predicted positions (n, 2), base px, in squares of a side of ``search_px``."""
     if not len(predicted) or not len(reference):
         return np.zeros((0, 2), np.int64)
     finite = np.flatnonzero(np.isfinite(predicted).all(axis=1))

@@ -2,20 +2,13 @@
 
 Paper: registration, 200 x 200 cells. The mesh models what the polyprojective cannot: smooth relief of the ground and
 deviations of the lens from its model. Its nodes are the cell centres. A first-difference penalty couples neighbouring
-nodes; cross-validation selects its weight, and drops the mesh if that does not lower the cross-validated residual.
+nodes; cross-validation selects its weight, and drops the mesh if that does not lower the cross-validated residual. The
+normal equations are banded: a fit costs nodes * rows^2 in place of nodes^3, and the fits without each fold are solved
+as one.
 
-A node is coupled to its eight neighbours only, so the normal equations are banded: a fit costs nodes *
-rows^2 in place of nodes^3, and the fits without each fold are solved as one.
-
-How accurate the whole map is where, `measure_support`: a standard deviation in cells, none where no control points
-support it.
-
-A map is an average of thousands of control points, and good wherever there are some around: between them it errs by
-little more than its noise. Beyond the last of them it is an extrapolation, which is off by pixels in the corners under
-a lens that the model does not quite describe, while all figures of the frame are as good as ever.
-
-The standard deviation of a cell is that of the mean of the hold-out residuals around it, with a term that grows with
-the distance to the nearest control points. Its two constants were set on simulated flights of seeds 1 to 3.
+How accurate the whole map is where, `measure_support` says: between its control points a map errs by little more than
+its noise; beyond the last of them it is an extrapolation, which is off by pixels in the corners under a lens that the
+model does not quite describe, while all figures of the frame are as good as ever.
 """
 
 from collections.abc import Sequence
@@ -41,7 +34,6 @@ _MIN_GAIN = 0.01
 _MIN_POINTS_PER_CELL = 2.0
 MESH_ITERATIONS = 3
 """Reweighted fits: each uses the robust weights of the residuals of the one before."""
-
 
 CELLS = (24, 32)
 """Rows and columns of the cells over an image."""
@@ -129,14 +121,10 @@ def fit_mesh(
 
     Parameters
     ----------
-    xy_raw, residuals
-        Control points (n, 2), raw px, and their residuals (n, 2) after the parametric map, base px.
-    cv_residuals
-        (n, 2) cross-validated residuals of the parametric map.
+    xy_raw, residuals, cv_residuals
+        Control points (n, 2), raw px; residuals after the parametric map (n, 2), base px, fitted and cross-validated.
     weights
         (n,) of the control points: robust weight over variance.
-    width, height
-        Raw frame, px.
     fold
         (n,) fold of each control point; None: by cells of 48 px.
     stiffnesses
@@ -264,12 +252,17 @@ class Support:
 
 def sample_cells(cells: FloatArray | Float32Array, xy: FloatArray, width: int, height: int) -> FloatArray:
     """Values (n,) of cells (rows, columns) over an image at points (n, 2); NaN at points that are not finite."""
-    rows, columns = cells.shape
     finite = np.asarray(np.isfinite(xy).all(axis=1))
-    x, y = np.where(finite[:, None], xy, 0.0).T
-    row = np.clip((y + 0.5) / height * rows, 0, rows - 1).astype(np.int64)
-    column = np.clip((x + 0.5) / width * columns, 0, columns - 1).astype(np.int64)
-    return np.where(finite, cells[row, column].astype(np.float64), np.nan)
+    index = cell_index(np.where(finite[:, None], xy, 0.0), cells.shape, width, height)
+    return np.where(finite, cells.ravel()[index].astype(np.float64), np.nan)
+
+
+def cell_index(xy: FloatArray, cells: tuple[int, ...], width: int, height: int) -> IntArray:
+    """Number (n,), row by row, of the cell of (rows, columns) over an image in which, or beside which, points lie."""
+    rows, columns = cells
+    row = np.clip((xy[:, 1] + 0.5) / height * rows, 0, rows - 1).astype(np.int64)
+    column = np.clip((xy[:, 0] + 0.5) / width * columns, 0, columns - 1).astype(np.int64)
+    return np.asarray(row * columns + column)
 
 
 def no_support(width: int, height: int) -> Support:
@@ -283,7 +276,11 @@ def reach(width: int, height: int) -> float:
 
 
 def measure_support(xy: FloatArray, residuals: FloatArray, *, width: int, height: int) -> Support:
-    """Measure a map's accuracy by the hold-out residuals (n, 2) of its control points (n, 2)."""
+    """Measure a map's accuracy by the hold-out residuals (n, 2) of its control points (n, 2).
+
+    The standard deviation of a cell is that of the mean of the residuals around it, with a term that grows with the
+    distance to the nearest control points. Its two constants were set on simulated flights of seeds 1 to 3.
+    """
     if len(xy) < NEIGHBOURS:
         return no_support(width, height)
     rows, columns = CELLS
@@ -306,16 +303,10 @@ def measure_support(xy: FloatArray, residuals: FloatArray, *, width: int, height
 
 
 def bridge_holes(sd: Float32Array, cells: tuple[int, int]) -> Float32Array:
-    """Give cells (rows, columns) without a value the largest of those beside, above and below, where it has all four.
+    """Give cells (rows, columns) without a value, NaN, the largest of those beside, above and below, if there are four.
 
-    A bare roof amid control points is spanned by the map; only beyond the last of them it is an extrapolation.
-
-    Parameters
-    ----------
-    sd
-        (rows, columns), NaN where there is no value.
-    cells
-        How far the values may be, in cells up or down, and to either side.
+    A bare roof amid control points is spanned by the map; only beyond the last of them it is an extrapolation. The
+    values may be so many cells away up or down, and to either side.
 
     Examples
     --------

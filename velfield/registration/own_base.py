@@ -123,22 +123,10 @@ def build_own_base(
     lens: Lens,
     config: RegistrationConfig,
 ) -> OwnBase | Failure:
-    """Build the flight's own base image on the undistorted grid of a reference frame.
+    """Build the flight's own base image on the undistorted grid of a reference frame, the sharpest of the frames.
 
-    Parameters
-    ----------
-    read
-        Frame number to grey frame (h, w) uint8.
-    detect
-        Frame number to its keypoints, raw px; it may be asked for the same ones several times.
-    frames
-        The frames to use, in time order, including the reference.
-    reference
-        The frame that defines the grid: the sharpest.
-
-    Returns
-    -------
-    The base image, or a failure if fewer than three frames overlap the reference.
+    These are in time order; ``read`` gives the grey frame (h, w) uint8 of a number, ``detect`` its keypoints, raw px,
+    the same ones several times. A failure if fewer than three frames overlap the reference.
     """
     grey = read(reference)
     grid, base, mask = _undistort_reference(grey, lens)

@@ -39,13 +39,7 @@ _MAX_CORRECTION_PX = 1.5
 
 
 def match_frame_pairs(frames: Sequence[GreyImage]) -> FramePairs | None:
-    """The most informative frame pairs, each with up to 200 matches; None if no two frames match.
-
-    Parameters
-    ----------
-    frames
-        (h, w) uint8, all of one size.
-    """
+    """The most informative pairs of frames (h, w) uint8, each with up to 200 matches; None if no two frames match."""
     shape = (frames[0].shape[0], frames[0].shape[1])
     keypoints = parallel_map(_detect, frames)
 

@@ -58,12 +58,10 @@ class PolyprojectiveTransform:
 
     Paper: the polyprojective model. ``x' = a.m / c.m``, ``y' = b.m / c.m`` with ``m = (1, x, y, x^2, xy, y^2)``.
 
-    Parameters
+    Attributes
     ----------
-    coefficients
-        (3, 6): rows a, b, c; c starts with 1. They act on normalised coordinates.
-    source, target
-        (3,) each: (cx, cy, s); the normalised coordinate is (x - cx) * s.
+    coefficients : (3, 6), rows a, b, c; c starts with 1. They act on normalised coordinates.
+    source, target : (3,) each: (cx, cy, s); the normalised coordinate is (x - cx) * s.
     """
 
     coefficients: FloatArray
@@ -108,11 +106,7 @@ class PolyprojectiveTransform:
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back by Newton's method from the homography's inverse; NaN rows where it fails."""
-        return _invert(xy, self.homography_inverse(xy), self)
-
-    def homography_inverse(self, xy: FloatArray) -> FloatArray:
-        """Map points (n, 2) back by the first-order terms alone."""
-        return self._homography.inverse(xy)
+        return _invert(xy, self._homography.inverse(xy), self)
 
     @cached_property
     def _homography(self) -> HomographyTransform:
@@ -197,21 +191,15 @@ class FrameTransform:
     raw -> lens undistortion -> rolling-shutter correction (row spline) -> polyprojective -> plus displacement mesh ->
     base.
 
-    Parameters
+    Attributes
     ----------
-    width, height
-        Size of the raw frame, px.
-    lens
-        The camera's lens.
-    polyprojective
-        Undistorted px to base px; a homography has zero second-order terms.
-    row_coefficients
-        (3, knots): uniform cubic B-spline over the raw rows of the shift in x and y (undistorted px) and the roll
-        about the frame's centre (rad); knots may be 0.
-    mesh
-        (my, mx, 2) displacement at the cell centres of the raw frame, base px; None is zero displacement.
-    cell_size_px
-        Side of a mesh cell, raw px.
+    width, height : size of the raw frame, px.
+    lens : the camera's.
+    polyprojective : undistorted px to base px; a homography has zero second-order terms.
+    row_coefficients : (3, knots), uniform cubic B-spline over the raw rows of the shift in x and y (undistorted px) and
+        the roll about the frame's centre (rad); knots may be 0.
+    mesh : (my, mx, 2) displacement at the cell centres of the raw frame, base px; None is zero displacement.
+    cell_size_px : side of a mesh cell, raw px.
     """
 
     width: int
@@ -273,10 +261,6 @@ class FrameTransform:
         cosine, sine = jacobian[0, 0] + jacobian[1, 1], jacobian[1, 0] - jacobian[0, 1]
         return float(0.5 * np.hypot(cosine, sine)), float(np.arctan2(sine, cosine))
 
-    def then(self, transform: "PlaneTransform") -> "ComposedTransform":
-        """This map followed by another: from the flight's own base image to a given one."""
-        return ComposedTransform(self, transform)
-
     def to_vector(self, config: RegistrationConfig) -> FloatArray:
         """The parameters as one flat float64 vector of `vector_length`; the lens is in ``camera.json``."""
         my, mx = mesh_shape(self.width, self.height, config.cell_size_px)
@@ -319,14 +303,8 @@ class FrameTransform:
 class MeshedTransform:
     """A polyprojective plus a displacement mesh, from one base image to another.
 
-    Parameters
-    ----------
-    polyprojective
-        Px of the one image to px of the other.
-    mesh
-        (my, mx, 2) displacement at the cell centres of the first image, px of the second.
-    cell_size_px
-        Side of a cell, px of the first image.
+    ``mesh`` (my, mx, 2) has the displacement at the centres of cells of ``cell_size_px`` of the first image, px of the
+    second.
     """
 
     polyprojective: PolyprojectiveTransform
@@ -375,10 +353,6 @@ class ComposedTransform:
     def to_raw(self, xy_base: FloatArray) -> FloatArray:
         """Base pixels (n, 2) to raw pixels (n, 2); NaN rows where there is no inverse."""
         return self.first.to_raw(self.second.inverse(xy_base))
-
-    def then(self, transform: PlaneTransform) -> "ComposedTransform":
-        """This map followed by another: from one base image to the next."""
-        return ComposedTransform(self, transform)
 
 
 FrameMap = FrameTransform | ComposedTransform

@@ -37,11 +37,11 @@ corrected so many times; nodes that are not this accurate before the last one, b
 class RawToBase(Protocol):
     """The map of a frame: `FrameTransform`, or a composition of it."""
 
-    def to_base(self, xy_raw: FloatArray) -> FloatArray:
+    def to_base(self, xy_raw: FloatArray, /) -> FloatArray:
         """Raw pixels (n, 2) to base pixels (n, 2)."""
         ...
 
-    def to_raw(self, xy_base: FloatArray) -> FloatArray:
+    def to_raw(self, xy_base: FloatArray, /) -> FloatArray:
         """Base pixels (n, 2) to raw pixels (n, 2); NaN rows where there is no inverse."""
         ...
 
@@ -55,25 +55,15 @@ def warp_to_base(
     interpolation: int = cv2.INTER_LINEAR,
     replicate_border: bool = False,
 ) -> tuple[GreyImage, Mask]:
-    """Resample a raw frame onto a window of the base image's grid.
+    """Resample a raw frame (h, w) uint8 onto a window of the base image's grid, with ``scale`` output px per base px.
 
-    Parameters
-    ----------
-    grey_raw
-        (h, w) uint8 raw frame.
-    window
-        x, y, width, height of the output window, base px.
-    scale
-        Output px per base px. Output pixel (i, j) lies at base x = x0 + (j + 0.5) / scale - 0.5, y likewise.
-    interpolation
-        OpenCV's flag: linear by default, cubic for base images.
-    replicate_border
-        Replicate the frame's border outside the frame in place of zeros, so that no artificial edge appears there.
+    Output pixel (i, j) of the window (x0, y0, width, height), base px, lies at base x = x0 + (j + 0.5) / scale - 0.5, y
+    likewise. OpenCV's flag ``interpolation`` is linear by default, cubic for base images.
 
     Returns
     -------
-    Image (round(h scale), round(w scale)) uint8, zero outside the frame unless ``replicate_border``, and mask, bool,
-    true inside the frame.
+    Image (round(h scale), round(w scale)) uint8, zero outside the frame, or with ``replicate_border`` continued, so
+    that no artificial edge appears there; and mask, bool, true inside the frame.
     """
     shape = round(window[3] * scale), round(window[2] * scale)
     step, coarse = _interpolable_map(transform, window=window, scale=scale, shape=shape)
@@ -255,12 +245,8 @@ class Rectification:
         self.resample(np.ones(self._done.shape, bool))
 
     def resample(self, cells: Mask, side_px: int = CELL_PX) -> None:
-        """Fill `image` and `valid` in the cells of `CELL_PX` in which those of a mask lie, unless filled before.
-
-        Parameters
-        ----------
-        cells
-            (rows, columns) of cells of ``side_px``, of which a whole number makes `CELL_PX`.
+        """Fill `image` and `valid` in the cells of `CELL_PX` in which those of a mask (rows, columns) lie,
+        unless filled before; a whole number of ``side_px`` makes `CELL_PX`.
         """
         if side_px != CELL_PX:
             cells = _join_cells(cells, CELL_PX // side_px, self._done.shape)
@@ -286,16 +272,10 @@ def extend_border(source: GreyImage) -> GreyImage:
 def resample_cells(
     extended: GreyImage, coarse: Float32Array, step: int, cells: IntArray, image: GreyImage, valid: Mask
 ) -> None:
-    """Fill cells of an image (h, w) and of its mask, which is true inside the frame; outside its border goes on.
+    """Fill cells of `CELL_PX`, (n, 2) rows and columns, of an image (h, w) and of its mask, true inside the frame.
 
-    Parameters
-    ----------
-    extended
-        The source by `extend_border`.
-    coarse
-        (my, mx, 2) position in the source itself at centres of cells of ``step`` px, with one more cell on each side.
-    cells
-        (n, 2) row and column of cells of `CELL_PX`.
+    ``extended`` is the source by `extend_border`, which goes on outside; ``coarse`` (my, mx, 2) is the position in the
+    source itself at centres of cells of ``step`` px, with one more cell on each side.
     """
     resample_kernel(extended, as_words(extended), coarse, step, np.ascontiguousarray(cells), image, valid)
 
@@ -309,12 +289,8 @@ def _raw_px_per_cell(coarse: FloatArray) -> float:
 
 
 def footprint(transform: RawToBase, frame_shape: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Bounding box (x0, y0, x1, y1) of a frame on the base image, base px; NaN if the map has no finite value.
-
-    Parameters
-    ----------
-    frame_shape
-        (height, width) of the raw frame.
+    """Bounding box (x0, y0, x1, y1) of a raw frame of (height, width) on the base image, base px; NaN if the map has no
+    finite value.
     """
     height, width = frame_shape
     x, y = np.linspace(0, width - 1, _BORDER_POINTS), np.linspace(0, height - 1, _BORDER_POINTS)

@@ -32,6 +32,7 @@ from velfield.errors import InputError
 from velfield.registration.intersensor.base_mesh import BaseMesh
 from velfield.registration.mesh import Support, sample_cells
 from velfield.registration.transforms import (
+    ComposedTransform,
     FrameMap,
     FrameTransform,
     MeshedTransform,
@@ -289,7 +290,7 @@ class FrameTransforms:
             vector, width=self.width, height=self.height, lens=self.lens, config=self.config
         )
         for following in self.base_maps:
-            transform = transform.then(following.transform)
+            transform = ComposedTransform(transform, following.transform)
         return transform
 
     def position_sd_px(self, frame: int, xy_raw: FloatArray) -> FloatArray:

@@ -43,14 +43,9 @@ def describe_rate(folder: Path, names: Sequence[str], fps: float) -> tuple[str, 
 
 
 def read_flight_start(source: Path, info: SourceInfo, telemetry: Path | None = None) -> FlightStart | None:
-    """When a source's first frame was taken; None where nothing in it says so.
+    """When the first frame of a video, list of clips or folder of images was taken; None where nothing says so.
 
-    Parameters
-    ----------
-    source, info
-        The video, list of clips or folder of images, and its facts.
-    telemetry
-        A file of telemetry given; its times count from the first frame.
+    The times of a file of telemetry that is given count from the first frame.
     """
     if telemetry is not None and (start := _start(read_telemetry_file(telemetry, info), telemetry)) is not None:
         return start

@@ -32,13 +32,8 @@ Model = Literal["similarity", "affine"]
 def read_control_points(path: Path | str, epsg: int | None = None) -> tuple[tuple[ControlPoint, ...], int]:
     """Control points of a CSV, and the EPSG code of their coordinates.
 
-    Parameters
-    ----------
-    path
-        Columns ``x_px, y_px`` (pixels of the base image) and ``longitude, latitude`` or ``x, y``; optional ``name`` and
-        ``epsg``.
-    epsg
-        Code of ``x, y``, where the file has no column for it.
+    It has the columns ``x_px, y_px`` (pixels of the base image) and ``longitude, latitude`` or ``x, y``; optional are
+    ``name`` and ``epsg``, the code of ``x, y``, which may be given.
 
     Raises
     ------
@@ -95,20 +90,10 @@ class _Fit:
 def fit_control_points(
     points: Sequence[ControlPoint], epsg: int, *, shape: tuple[int, int], base_digest: str, model: Model | None = None
 ) -> ControlPointsRecord:
-    """Fit the map to control points.
+    """Fit the map of a base image (h, w) to three control points or more; degrees are projected to their UTM zone.
 
-    Parameters
-    ----------
-    points
-        Three or more, not on one line.
-    epsg
-        Code of their coordinates; degrees are projected to their UTM zone.
-    shape
-        (h, w) of the base image.
-    base_digest
-        Digest of the base image.
-    model
-        None: a similarity, or with six points or more an affine transform where that is closer at points left out.
+    Without a model it is a similarity, or with six points or more an affine transform where that is closer at points
+    left out.
 
     Raises
     ------

@@ -9,14 +9,7 @@ import numpy as np
 from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
-from velfield.sources.frames import (
-    IMAGE_SUFFIXES,
-    VIDEO_SUFFIXES,
-    FootageLoss,
-    SourceFrame,
-    SourceInfo,
-    unreadable_frame,
-)
+from velfield.sources.frames import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FootageLoss, SourceFrame, SourceInfo
 from velfield.sources.images import check_size, describe_levels, folder_levels, image_size, read_grey_image
 from velfield.sources.quality import FrameFlag
 from velfield.sources.timestamps import read_timestamps
@@ -104,13 +97,13 @@ def _read(path: Path, info: SourceInfo, index: int) -> SourceFrame:
     try:
         grey = read_grey_image(path / name, info.max_pixels, info.levels)
     except InputError as error:
-        return unreadable_frame(info, index, int(FrameFlag.UNREADABLE), str(error))
+        return info.frame(index, None, int(FrameFlag.UNREADABLE), str(error))
     if grey.shape != info.shape:
         raise InputError(
             f"{path.name}: found {name} of {grey.shape[1]}x{grey.shape[0]}, expected {info.width}x{info.height}; "
             "the folder has changed; start again"
         )
-    return SourceFrame(index, name, float(info.times_s[index]), grey, 0)
+    return info.frame(index, grey)
 
 
 def _with_times(

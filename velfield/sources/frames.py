@@ -22,18 +22,9 @@ _PROTOCOL = re.compile(r"^([A-Za-z][A-Za-z0-9+.\-]+):")
 
 
 def local_path(path: Path | str, what: str) -> Path:
-    """Resolve `path` to an existing file or folder of this machine.
+    """Resolve a user's path to an existing file or folder of this machine; messages name it ``what``.
 
-    Parameters
-    ----------
-    path
-        As given by the user.
-    what
-        Name of the thing, for the message: "video or image folder", "base image".
-
-    Returns
-    -------
-    Absolute path: no library can take it for a protocol (``concat:``, ``http:``) or an option.
+    It is absolute: no library can take it for a protocol (``concat:``, ``http:``) or an option.
 
     Raises
     ------
@@ -135,9 +126,7 @@ class SourceInfo:
         """Shape of a frame, (h, w)."""
         return self.height, self.width
 
-
-def unreadable_frame(info: SourceInfo, index: int, flags: int, reason: str) -> SourceFrame:
-    """Stand-in for a frame that could not be read: zeros, with the reason."""
-    return SourceFrame(
-        index, info.names[index], float(info.times_s[index]), np.zeros(info.shape, np.uint8), flags, reason
-    )
+    def frame(self, index: int, grey: GreyImage | None, flags: int = 0, reason: str = "") -> SourceFrame:
+        """The frame of an index; zeros, with flags and the reason, where it could not be read."""
+        grey = np.zeros(self.shape, np.uint8) if grey is None else grey
+        return SourceFrame(index, self.names[index], float(self.times_s[index]), grey, flags, reason)

@@ -19,11 +19,11 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.flight import FramesConfig
 from velfield.errors import InputError, one_line
 from velfield.sources.frames import local_path
-from velfield.sources.images import check_size, read_grey_image
+from velfield.sources.images import check_size, read_grey_image, read_magic
 
 TIFF_DRIVERS = ((b"II*\0", "GTiff"), (b"MM\0*", "GTiff"), (b"II+\0", "GTiff"), (b"MM\0+", "GTiff"))
 _PICTURE_DRIVERS = ((b"\x89PNG", "PNG"), (b"\xff\xd8\xff", "JPEG"), (b"BM", "BMP"))
-_WGS84_A_M, _WGS84_E2 = 6378137.0, 0.00669437999014
+WGS84_A_M, WGS84_E2 = 6378137.0, 0.00669437999014
 _SQUARE = 0.02
 """Pixels whose two sides differ by more than this fraction are not square; speeds would depend on direction."""
 MAX_GSD_DISAGREEMENT = 0.02
@@ -54,14 +54,9 @@ class BaseRaster:
 def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
     """Read the base image given as ``--base``.
 
-    Parameters
-    ----------
-    path
-        GeoTIFF; or PNG, JPEG, TIFF, BMP, with its reference system where there are a world file and a ``.prj`` or
-        ``.aux.xml`` beside it. An image in degrees is reprojected to the UTM zone of its centre. A local reference
-        system, as of a survey without GPS, gives the scale alone.
-    config
-        ``max_pixels``.
+    GeoTIFF; or PNG, JPEG, TIFF, BMP, with its reference system where there are a world file and a ``.prj`` or
+    ``.aux.xml`` beside it. An image in degrees is reprojected to the UTM zone of its centre. A local reference system,
+    as of a survey without GPS, gives the scale alone.
 
     Raises
     ------
@@ -69,7 +64,7 @@ def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
         An address, a VRT, another format, too large, truncated, pixels that are not square on the ground.
     """
     file = local_path(path, "base image")
-    head = _read_magic(file)
+    head = read_magic(file, "a base image; check it")
     driver = next((name for magic, name in TIFF_DRIVERS if head.startswith(magic)), None)
     if driver is not None:
         return _read_geotiff(file, config.max_pixels)
@@ -101,14 +96,8 @@ def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *
 
 def true_north_rad(crs_wkt: str, affine: Sequence[float], shape: tuple[int, int], *, name: str) -> float:
     """Direction of true north in the middle of an image, from +x towards +y (down): a reference system's own north is
-    off by up to some degrees, 2.3 in a UTM zone at 50 degrees.
-
-    Parameters
-    ----------
-    affine
-        (6,) row by row: from pixels to the coordinates of the system.
-    shape
-        (height, width) px.
+    off by up to some degrees, 2.3 in a UTM zone at 50 degrees. ``affine`` (6,), row by row, is from pixels to the
+    coordinates of the system, ``shape`` (height, width) px.
     """
     crs, matrix = CRS.from_wkt(crs_wkt), np.reshape(affine, (2, 3))
     x, y = matrix @ (shape[1] / 2, shape[0] / 2, 1.0)
@@ -193,16 +182,6 @@ def ignore_missing_georeference() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield
-
-
-def _read_magic(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(16)
-    except OSError as error:
-        raise InputError(
-            f"{path.name}: could not be read ({error.strerror}), expected a base image; check it"
-        ) from None
 
 
 def _read_geotiff(path: Path, max_pixels: int) -> BaseRaster:
@@ -368,8 +347,8 @@ def _apply_affine(affine: Affine, column: float, row: float) -> tuple[float, flo
 def _ground_distance(longitude: FloatArray, latitude: FloatArray) -> float:
     """Metres between two nearby points on the WGS 84 ellipsoid, by its radii of curvature at their midpoint."""
     middle = float(latitude.mean())
-    flat = 1 - _WGS84_E2 * np.sin(middle) ** 2
-    north = _WGS84_A_M * (1 - _WGS84_E2) / flat**1.5 * (latitude[1] - latitude[0])
+    flat = 1 - WGS84_E2 * np.sin(middle) ** 2
+    north = WGS84_A_M * (1 - WGS84_E2) / flat**1.5 * (latitude[1] - latitude[0])
     difference = (longitude[1] - longitude[0] + np.pi) % (2 * np.pi) - np.pi
-    east = _WGS84_A_M / np.sqrt(flat) * np.cos(middle) * difference
+    east = WGS84_A_M / np.sqrt(flat) * np.cos(middle) * difference
     return float(np.hypot(north, east))

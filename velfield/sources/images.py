@@ -102,20 +102,9 @@ def _read_png_tail(path: Path) -> tuple[Image.Exif, bytes]:
 
 
 def read_grey_image(path: Path | str, max_pixels: int, levels: Levels | None = None) -> GreyImage:
-    """Read an image as grey.
+    """Read a PNG, JPEG, TIFF or BMP as grey (h, w) uint8, rows as stored; colours by ITU-R 601 luma.
 
-    Parameters
-    ----------
-    path
-        PNG, JPEG, TIFF or BMP on this machine.
-    max_pixels
-        Most pixels that memory is allocated for.
-    levels
-        Levels of an image of more than 8 bits a channel that become 0 and 255; None: by `stretch_levels` of itself.
-
-    Returns
-    -------
-    (h, w) uint8, rows as stored; colours by ITU-R 601 luma.
+    ``levels`` of an image of more than 8 bits a channel become 0 and 255; None: by `stretch_levels` of itself.
 
     Raises
     ------
@@ -163,14 +152,23 @@ def _refuse_pages(path: Path, image: TiffImagePlugin.TiffImageFile) -> None:
     image.seek(0)
 
 
-def _image_plugin(path: Path) -> type:
+def read_magic(path: Path, expected: str) -> bytes:
+    """The first 16 bytes of a file, which tell its format.
+
+    Raises
+    ------
+    InputError
+        It cannot be read; ``expected`` ends the message.
+    """
     try:
         with path.open("rb") as file:
-            head = file.read(16)
+            return file.read(16)
     except OSError as error:
-        raise InputError(
-            f"{path.name}: could not be read ({error.strerror}), expected an image; check the path"
-        ) from None
+        raise InputError(f"{path.name}: could not be read ({error.strerror}), expected {expected}") from None
+
+
+def _image_plugin(path: Path) -> type:
+    head = read_magic(path, "an image; check the path")
     for magic, plugin in _MAGIC:
         if head.startswith(magic):
             return plugin

@@ -1,7 +1,4 @@
-"""Quality of a frame from its pixels alone, and the frames that are outliers within their sequence.
-
-Defects of a frame as the bits of one integer, a column of ``frames.zarr``.
-"""
+"""Defects of a frame, the bits of a column of ``frames.zarr``, from its pixels alone or within their sequence."""
 
 from enum import IntFlag
 
@@ -12,13 +9,7 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 
 
 class FrameFlag(IntFlag):
-    """Why a frame is not to be trusted; 0 where no defect is known.
-
-    Examples
-    --------
-    >>> FrameFlag.BLACK in FrameFlag(9), FrameFlag.BLURRED in FrameFlag(9)
-    (True, False)
-    """
+    """Why a frame is not to be trusted; 0 where no defect is known."""
 
     SUSPECT = 1
     """The bitstream was corrupt here or since the last key frame: the image may be wrong."""
@@ -34,14 +25,7 @@ class FrameFlag(IntFlag):
     """Correlates with neither neighbour, while those two correlate: it is not of the flight."""
 
 
-UNUSABLE = (
-    FrameFlag.SUSPECT
-    | FrameFlag.UNREADABLE
-    | FrameFlag.DUPLICATE
-    | FrameFlag.BLACK
-    | FrameFlag.BLURRED
-    | FrameFlag.OUTLIER
-)
+UNUSABLE = FrameFlag(sum(FrameFlag))
 """A frame with any of these is in no tracklet."""
 
 
@@ -88,18 +72,7 @@ def is_duplicate(grey: GreyImage, previous: GreyImage) -> bool:
 
 
 def flag_blurred(sharpness: FloatArray) -> Mask:
-    """Frames less than half as sharp as the median of the 15 frames about them.
-
-    Parameters
-    ----------
-    sharpness
-        (n,) as `frame_quality` gives it; NaN where unreadable.
-
-    Examples
-    --------
-    >>> flag_blurred(np.array([10.0, 11, 3, 10, 12, 10])).tolist()
-    [False, False, True, False, False, False]
-    """
+    """Frames less than half as sharp (n,) as the median of the 15 frames about them; NaN where unreadable."""
     sharpness = np.asarray(sharpness, np.float64)
     if sharpness.size < 3:
         return np.zeros(sharpness.shape, np.bool_)
@@ -124,20 +97,7 @@ _CUT_FRAMES = 5
 
 
 def find_cuts(thumbnails: Float32Array) -> list[int]:
-    """Frames from which on the picture is another one: uncorrelated to those before for some frames on either side.
-
-    Parameters
-    ----------
-    thumbnails
-        (n, 16, 16) as `frame_quality` gives them.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> here, there = rng.normal(size=(2, 16, 16)).astype(np.float32)
-    >>> find_cuts(np.stack([here] * 6 + [there] * 6))
-    [6]
-    """
+    """Frames from which on the thumbnails (n, 16, 16) of `frame_quality` are uncorrelated to those before."""
     flat = _detail(thumbnails)
     cuts: list[int] = []
     for k in range(2, len(flat) - 1):
@@ -192,13 +152,7 @@ def describe_light(brightness: FloatArray, contrast: FloatArray, sharpness: Floa
 
 
 def flag_outlier_frames(thumbnails: Float32Array) -> Mask:
-    """Frames that correlate neither with the frame before nor with the frame after, while those two do with each other.
-
-    Parameters
-    ----------
-    thumbnails
-        (n, 16, 16) as `frame_quality` gives them.
-    """
+    """Frames whose thumbnails (n, 16, 16) correlate with neither neighbour, while those two do with each other."""
     count = len(thumbnails)
     outlier = np.zeros(count, np.bool_)
     flat = _detail(thumbnails)

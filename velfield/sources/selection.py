@@ -8,30 +8,15 @@ from velfield.errors import InputError
 
 
 def select_frames(times_s: FloatArray, frames: FramesConfig) -> IntArray:
-    """Choose the frames to process.
+    """Choose the frames to process of those of times (n,), ascending, s: indices (m,), ascending.
 
-    Parameters
-    ----------
-    times_s
-        (n,) ascending, s. Of frames with equal times only the first can be chosen, so that no interval is zero.
-    frames
-        ``every``, ``target_interval_s``, ``start_s``, ``stop_s``; start and stop count from the first frame.
-
-    Returns
-    -------
-    (m,) int64 indices into `times_s`, ascending, their times strictly ascending.
+    Of frames with equal times only the first can be chosen, so that no interval is zero. Start and stop count from the
+    first frame.
 
     Raises
     ------
     InputError
         No frame lies between start and stop.
-
-    Examples
-    --------
-    >>> select_frames(np.arange(10) / 25, FramesConfig(every="auto"))
-    array([0, 5])
-    >>> select_frames(np.arange(10) / 25, FramesConfig(every=3, start_s=0.04))
-    array([1, 4, 7])
     """
     times_s = np.asarray(times_s, np.float64)
     if times_s.size == 0:

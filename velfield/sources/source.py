@@ -25,14 +25,8 @@ from velfield.sources.video.probe import probe_video
 def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = None) -> SourceInfo:
     """Facts of a video or an image folder: size, true times, names, defects. No frame is decoded.
 
-    Parameters
-    ----------
-    path
-        A video, or a folder of images, on this machine.
-    frames
-        ``fps`` for a source without times of its own, ``max_pixels``.
-    timestamps
-        CSV ``frame,time_s``: an image's file name or a video's 0-based frame index, and its time in s.
+    A source without times of its own needs ``frames.fps`` or ``timestamps``, a CSV ``frame,time_s`` of an image's file
+    name or a video's 0-based frame index, and its time in s.
 
     Raises
     ------
@@ -85,14 +79,10 @@ def iter_frames(
     """Read frames, in order; one frame for each index, defective ones with flags.
 
     A video is decoded in sequence from the key frame before the first index (seeking to a frame number lands
-    elsewhere); of a folder only the requested images are read.
+    elsewhere); of a folder only the requested images are read. Indices into `info` ascend.
 
     Parameters
     ----------
-    path, info
-        The source and its facts from `probe`.
-    indices
-        Ascending indices into `info`.
     after
         The frame processed just before the first of `indices`, if any: it is read for comparison only, so
         that a flight cut into units flags the same frames as an uncut one.

@@ -35,16 +35,9 @@ def read_text(path: Path, what: str) -> str:
 def read_csv_rows(
     path: Path, *, required: Sequence[str], optional: Sequence[str] | None = None, what: str
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield (line number, row) of a CSV with a header.
+    """Yield (line number, row) of a CSV with a header; ``what`` names its content in messages.
 
-    Parameters
-    ----------
-    path
-        The file.
-    required, optional
-        Columns it must and may have; ``optional = None`` allows any others.
-    what
-        Name of the table's content, for messages.
+    It must have the columns ``required`` and may have the ``optional`` ones; None allows any others.
 
     Raises
     ------

@@ -12,12 +12,7 @@ Times = dict[str, float]
 
 
 def read_timestamps(path: Path) -> Times:
-    """Read the time of each frame, s.
-
-    Parameters
-    ----------
-    path
-        CSV with the columns ``frame`` (an image's file name, or a video's 0-based frame index) and ``time_s``.
+    """Read the time of each frame, s, of a CSV: ``frame`` (an image's name, or a video's 0-based index), ``time_s``.
 
     Raises
     ------
@@ -38,16 +33,9 @@ def read_timestamps(path: Path) -> Times:
 
 
 def check_against_container(side_s: FloatArray, container_s: FloatArray, path: Path) -> None:
-    """Refuse frame times whose intervals disagree with the container's.
+    """Refuse a CSV's times (n,) whose intervals disagree with those of the container's (n,) of the same frames, s.
 
     A constant offset is allowed: a CSV often counts from take-off.
-
-    Parameters
-    ----------
-    side_s, container_s
-        (n,) times of the same frames, s, in the container's order.
-    path
-        The CSV, for the message.
 
     Raises
     ------

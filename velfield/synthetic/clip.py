@@ -38,13 +38,7 @@ Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
 
 
 def simulate_telemetry(config: SimulationConfig, camera: Camera, base_shape: tuple[int, int]) -> list[str]:
-    """The subtitle of each frame.
-
-    Parameters
-    ----------
-    base_shape
-        (h, w) of the base image, whose middle is at the configured longitude and latitude.
-    """
+    """The subtitle of each frame; the middle of the base image (h, w) is at the configured longitude and latitude."""
     t, rng = config.telemetry, random_generator(config.seed, RandomStream.TELEMETRY)
     offset = rng.normal(0.0, (t.position_sd_m, t.position_sd_m, t.height_sd_m, t.heading_sd_deg))
     poses = np.concatenate([camera.row_table(k, np.array([camera.height / 2])) for k in range(config.frames)])

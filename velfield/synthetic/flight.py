@@ -1,6 +1,5 @@
 """A simulated flight in memory: city and camera from one seed, frames rendered on demand."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -178,10 +177,6 @@ class Flight:
     def prepare(self) -> None:
         """Compute what all frames share; call it before frames are rendered from several threads."""
         _ = self.city.traffic, self.city.scene, self.city.vehicles, self._undistorted, self._light
-
-    def frames(self) -> Iterator[GreyImage]:
-        """All frames in order."""
-        return (self.frame(i) for i in range(self.config.frames))
 
     def _vehicle_sprites(self, frame: int) -> VehicleSprites:
         cars = self.cars(frame)

@@ -25,14 +25,11 @@ class Errors:
 
     Attributes
     ----------
-    recall
-        Probability that a vehicle is detected, independently in each frame.
-    place_sd_px
-        Standard deviation of a detection's position along one axis, base px.
-    displacement_sd_px, claimed_sd_px
-        Standard deviation of an aligned link's displacement along one axis, and the one that the alignment reports.
-    unaligned_fraction
-        Fraction of links whose crops do not align, with the displacement of the detections.
+    recall : probability that a vehicle is detected, independently in each frame.
+    position_sd_px : standard deviation of a detection's position along one axis, base px.
+    displacement_sd_px, claimed_sd_px : standard deviation of an aligned link's displacement along one axis, and the one
+        that the alignment reports.
+    unaligned_fraction : fraction of links whose crops do not align, with the displacement of the detections.
     """
 
     recall: float = 0.97
@@ -56,21 +53,8 @@ def observed_tracklets(
 ) -> pd.DataFrame:
     """Tracklets of all vehicles within a (height, width) base image, one for each window of three frames.
 
-    Parameters
-    ----------
-    traffic
-        Trajectories of the vehicles.
-    times_s
-        (frames,) times of the frames.
-    to_px
-        Plan metres (n, 2) -> base pixels.
-    rng
-        For the errors.
-
-    Returns
-    -------
-    DataFrame
-        `schemas.tables.TRACKLET_COLUMNS`; the low 20 bits of a detection's id are the vehicle's number.
+    ``times_s`` (frames,) are those of the frames; ``to_px`` maps plan metres (n, 2) to base pixels. The table has
+    `schemas.tables.TRACKLET_COLUMNS`; the low 20 bits of a detection's id are the vehicle's number.
     """
     vehicle, frame, true, position = _detected(traffic, times_s, to_px, shape, rng, errors)
     moved, sd = _displacements(true, position, errors, rng)

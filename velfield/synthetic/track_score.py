@@ -31,18 +31,14 @@ class TrackScore:
 
     Attributes
     ----------
-    idf1, id_precision, id_recall
-        Identity metrics.
-    mota
-        Multiple object tracking accuracy.
-    switches, misses, false_positives
-        Counts: of vehicles that change their track, of positions of vehicles without one of a track, and the other way.
-    positions
-        Number of true positions.
-    tracks_per_vehicle
-        Mean number of tracks of a vehicle, each track being that of the vehicle that it is matched to most.
-    mixed_tracks
-        Fraction of the tracks that are matched to two vehicles or more, in two frames or more each.
+    idf1, id_precision, id_recall : identity metrics.
+    mota : multiple object tracking accuracy.
+    switches, misses, false_positives : counts: of vehicles that change their track, of positions of vehicles without
+        one of a track, and the other way.
+    positions : number of true positions.
+    tracks_per_vehicle : mean number of tracks of a vehicle, each track being that of the vehicle that it is matched to
+        most.
+    mixed_tracks : fraction of the tracks that are matched to two vehicles or more, in two frames or more each.
     """
 
     idf1: float
@@ -65,18 +61,10 @@ def score_run_tracks(
     to_truth: FloatArray | None = None,
     moving_only: bool = False,
 ) -> TrackScore:
-    """Score tracks over the registered frames of a run.
+    """Score the positions of a run's tracks (`Run.track_positions`) over its registered frames.
 
-    Parameters
-    ----------
-    tracks
-        ``frame, track_id, x_px, y_px`` of each position (`Run.track_positions`).
-    frame_of
-        Frame of the flight for each frame of the run, of those that are registered.
-    to_truth
-        Homography to the truth's base image, where the run has another one.
-    moving_only
-        Score only the vehicles that move at some time of the flight; tracks of the others are ignored.
+    ``frame_of`` gives the flight's frame of each of these, ``to_truth`` the homography to the truth's base image where
+    the run has another one. With ``moving_only`` the vehicles that never move and their tracks are ignored.
     """
     by_frame = dict(list(tracks.groupby("frame")))
     moving = truth.cars.loc[truth.cars["moving"], "vehicle_id"].unique()
@@ -104,12 +92,9 @@ class FrameObjects:
 
     Attributes
     ----------
-    vehicle, vehicle_xy, counts
-        (n,) ids, (n, 2) px, and (n,) whether the vehicle counts; the others are ignored.
-    direction_rad, length_px
-        (n,) axes and lengths of the vehicles.
-    track, track_xy
-        (m,) ids and (m, 2) px.
+    vehicle, vehicle_xy, counts : (n,) ids, (n, 2) px, and (n,) whether the vehicle counts; the others are ignored.
+    direction_rad, length_px : (n,) axes and lengths of the vehicles.
+    track, track_xy : (m,) ids and (m, 2) px.
     """
 
     vehicle: IntArray
@@ -124,18 +109,6 @@ class FrameObjects:
 def score_tracks(frames: Iterator[FrameObjects], *, match_px: float) -> TrackScore:
     """Score tracks, frame by frame; a position within ``match_px`` of a vehicle's centre can match it, along a long
     vehicle within a third of its length (boxes that overlap by half, TrackEval's limit).
-
-    Examples
-    --------
-    >>> one = np.array([[0.0, 0.0]])
-    >>> car = dict(vehicle=np.array([7]), counts=np.array([True]))
-    >>> car |= dict(direction_rad=np.zeros(1), length_px=np.array([16.0]))
-    >>> objects = [
-    ...     FrameObjects(**car, vehicle_xy=one + k, track=np.array([k // 2]), track_xy=one + k) for k in range(4)
-    ... ]
-    >>> score = score_tracks(iter(objects), match_px=2.0)
-    >>> score.switches, score.mota, score.idf1, score.tracks_per_vehicle
-    (1, 0.75, 0.5, 2.0)
     """
     last: dict[int, int] = {}
     before: dict[int, int] = {}

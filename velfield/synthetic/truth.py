@@ -63,10 +63,6 @@ class Truth:
         """Raw pixels (n, 2) of a frame -> base pixels (n, 2), exact."""
         return self.camera.to_base(frame, xy_raw)
 
-    def to_raw(self, frame: int, xy_base: FloatArray) -> FloatArray:
-        """Base pixels (n, 2) -> raw pixels (n, 2) of a frame, also beyond its border, exact."""
-        return self.camera.to_raw(frame, xy_base)
-
     def direction_error_rad(self, xy: FloatArray, direction_rad: FloatArray) -> FloatArray:
         """Angle between directions (n,) at base pixels (n, 2) and the closest direction of a lane there, rad.
 

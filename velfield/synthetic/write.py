@@ -22,13 +22,9 @@ WRITERS = 2
 
 
 def write_flight(out: Path, config: SimulationConfig, progress: Callable[[int, int], None] | None = None) -> Flight:
-    """Write ``frames/`` or a clip, ``timestamps.csv``, ``base.png``, ``labels.csv`` and ``truth/`` into ``out``.
+    """Write ``frames/`` or a clip, ``timestamps.csv``, ``base.png``, ``labels.csv`` and ``truth/`` into a folder.
 
-    Parameters
-    ----------
-    out : folder, created if needed; one with other files is refused.
-    config : SimulationConfig
-    progress : called with (frames done, number of frames).
+    It is created if needed; ``progress`` is called with (frames done, number of frames).
 
     Raises
     ------

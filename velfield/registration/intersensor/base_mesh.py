@@ -6,14 +6,16 @@ through the map found so far, the mesh is fitted to what is left, and both are r
 pixels off in the corners matches few patches there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import FloatArray, GreyImage, Mask
 from schemas.flight import BaseConfig
-from velfield.registration.control_points import FOLDS, ControlPoints, robust_scale
+from velfield.registration.control_points import ControlPoints, assign_folds, robust_scale
 from velfield.registration.intersensor.correlation import match_grid
 from velfield.registration.intersensor.modality import MODALITIES, Modality
 from velfield.registration.joint import robust_weights
@@ -57,18 +59,10 @@ class BaseMesh:
 def fit_base_mesh(
     own: GreyImage, valid: Mask, given: GreyImage, start: PolyprojectiveTransform, config: BaseConfig
 ) -> BaseMesh:
-    """Fit a mesh to the displacement that a polyprojective between two base images leaves.
+    """Fit a mesh to the displacement that ``start``, a polyprojective from own px to given px, leaves.
 
-    Parameters
-    ----------
-    own, valid
-        (h, w) uint8 and bool: the flight's own base image and where it is valid.
-    given
-        (H, W) uint8.
-    start
-        Own px to given px.
-    config
-        The base section of the flight's configuration: its patches are used where the small ones do not agree.
+    ``own`` and ``valid`` (h, w) uint8 and bool are the flight's own base image and where it is valid, ``given`` (H, W)
+    uint8. The configuration's patches are used where the small ones do not agree.
     """
     images = _Images(own, valid, given, start)
     fit, agreeing = _fit(images, PATCH_PX, SPACING_PX)
@@ -91,7 +85,7 @@ class _Images:
         self, transform: MeshedTransform, modality: Modality, *, patch_px: int, spacing_px: int, radius_px: int
     ) -> ControlPoints:
         """Matches of the own image, warped by a map, with the given one: own px to given px."""
-        image_map = _AsRaw(transform)
+        image_map = _AsRaw(transform, transform.inverse)
         window = (0, 0, self.given.shape[1], self.given.shape[0])
         moving, mask = warp_to_base(self.own, image_map, window=window)
         inside, _ = warp_to_base(self.valid.astype(np.uint8) * 255, image_map, window=window)
@@ -135,7 +129,7 @@ def _fit(images: _Images, patch_px: int, spacing_px: int) -> tuple[BaseMesh, flo
                 width=width,
                 height=height,
                 cell_size_px=CELL_PX,
-                fold=_assign_folds(points.xy_raw, fold_px),
+                fold=assign_folds(points.xy_raw, fold_px),
             )
             left = fit.residuals
         mesh = np.zeros((1, 1, 2)) if fit.mesh is None else fit.mesh
@@ -167,21 +161,8 @@ def _choose_modality(images: _Images, transform: MeshedTransform, patch_px: int,
     return max(MODALITIES.values(), key=agreeing)
 
 
-@dataclass(frozen=True, eq=False)
-class _AsRaw:
-    """The own base image as a raw frame."""
+class _AsRaw(NamedTuple):
+    """The own base image as a raw frame, and the given one as its base."""
 
-    transform: MeshedTransform
-
-    def to_base(self, xy_raw: FloatArray) -> FloatArray:
-        """Own px (n, 2) to given px (n, 2)."""
-        return self.transform(xy_raw)
-
-    def to_raw(self, xy_base: FloatArray) -> FloatArray:
-        """Given px (n, 2) to own px (n, 2)."""
-        return self.transform.inverse(xy_base)
-
-
-def _assign_folds(xy: FloatArray, side_px: float) -> IntArray:
-    cell = np.floor(xy / side_px).astype(np.int64)
-    return np.asarray((cell[:, 0] * 2 + cell[:, 1]) % FOLDS)
+    to_base: Callable[[FloatArray], FloatArray]
+    to_raw: Callable[[FloatArray], FloatArray]

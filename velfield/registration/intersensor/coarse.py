@@ -65,13 +65,7 @@ def downscale(grey: GreyImage, scale: float) -> GreyImage:
 
 
 def sift_scale(shape: tuple[int, ...], scale: float) -> float:
-    """The scale for SIFT: ``scale``, but larger for images that would become too small.
-
-    Examples
-    --------
-    >>> sift_scale((1920, 2560), 0.25) > 0.25, sift_scale((392, 370), 0.25)
-    (True, 1.0)
-    """
+    """The scale for SIFT: ``scale``, but larger for images that would become too small."""
     return float(min(1.0, max(scale, _MIN_SIFT_SIDE_PX / max(shape))))
 
 
@@ -84,20 +78,11 @@ def sift_keypoints(grey: GreyImage, scale: float) -> Keypoints:
 def estimate_sift_homography(
     image: GreyImage, of_base: Keypoints, lens: Lens, *, scale: float, mirrored: bool = False
 ) -> SiftHomography:
-    """Homography of the SIFT matches between a frame and the base image, by MAGSAC.
+    """Homography of the SIFT matches between a frame (h, w) uint8 and the base image, by MAGSAC: undistorted px to
+    base px. The frame's keypoints are detected at a ``scale``.
 
-    Parameters
-    ----------
-    image
-        (h, w) uint8.
-    of_base
-        Keypoints of the base image.
-    lens
-        Undistorts the frame's keypoints; the homography maps undistorted px to base px.
-    scale
-        Scale at which the frame's keypoints are detected.
-    mirrored
-        Flip the frame left to right first: to recognise a flipped base image, never to register to it.
+    With ``mirrored`` the frame is flipped left to right first: to recognise a flipped base image, never to register to
+    it.
     """
     if mirrored:
         image = np.ascontiguousarray(image[:, ::-1])
@@ -143,23 +128,10 @@ def search_similarity(
 ) -> list[CoarseCandidate]:
     """Search over scales and rotations: match the frame's centre as a template in the base image, both downscaled.
 
-    Parameters
-    ----------
-    image, base
-        (h, w) uint8.
-    lens
-        The frame's lens.
-    scales, rotations_rad
-        Candidates: base px per frame px, and rotation from +x towards +y; relative to ``initial`` if given.
-    initial
-        (3, 3) undistorted frame px -> base px; the candidates are applied before it, about the frame's centre.
-    template_half_px
-        Half the side of the template, downscaled px; determines the downscaling.
-
-    Returns
-    -------
-    list of CoarseCandidate
-        The best of each modality, highest correlation first; empty if no template fits into the base image.
+    Candidates are base px per frame px, and rotation from +x towards +y; with ``initial`` (3, 3), undistorted frame px
+    -> base px, they are applied before it, about the frame's centre. Half the side of the template, downscaled px,
+    determines the downscaling. Returned are the best of each modality, highest correlation first; none if no template
+    fits into the base image.
     """
     height, width = image.shape
     centre = lens.undistort_points(np.array([[(width - 1) / 2, (height - 1) / 2]]))[0]

@@ -38,6 +38,7 @@ _FIRST_SIDE_PX = 400.0
 _TARGET_POINTS = 500
 _MIN_SCORE = 0.2
 _MIN_POINTS = 20
+_RESELECTIONS = 20
 _FOLDS = 5
 
 
@@ -149,20 +150,8 @@ def warp_to_base_grid(
 ) -> tuple[GreyImage, Mask, GreyImage, tuple[int, int]] | None:
     """The frame warped to the base image's grid at a scale, its mask, that part of the base image, the part's origin.
 
-    None if they do not overlap by more than a patch.
+    The part is what the frame covers, plus the search radius; None if they do not overlap by more than a patch.
     """
-    window = _base_window(pair, transform)
-    if window is None:
-        return None
-    x0, y0, width, height = window
-    moving, mask = warp_to_base(pair.image, transform, window=window, scale=scale)
-    reference = downscale(np.ascontiguousarray(pair.base[y0 : y0 + height, x0 : x0 + width]), scale)
-    rows, columns = min(moving.shape[0], reference.shape[0]), min(moving.shape[1], reference.shape[1])
-    return moving[:rows, :columns], mask[:rows, :columns], reference[:rows, :columns], (x0, y0)
-
-
-def _base_window(pair: ImagePair, transform: FrameTransform) -> tuple[int, int, int, int] | None:
-    """The part of the base image that the frame covers, plus the search radius: x, y, width, height, px."""
     x0, y0, x1, y1 = footprint(transform, (pair.image.shape[0], pair.image.shape[1]))
     if not np.isfinite([x0, y0, x1, y1]).all():
         return None
@@ -170,8 +159,13 @@ def _base_window(pair: ImagePair, transform: FrameTransform) -> tuple[int, int, 
     margin = pair.config.search_radius_px
     left, top = max(int(x0) - margin, 0), max(int(y0) - margin, 0)
     right, bottom = min(int(x1) + margin + 1, width), min(int(y1) + margin + 1, height)
-    patch = pair.config.patch_size_px
-    return (left, top, right - left, bottom - top) if min(right - left, bottom - top) > patch else None
+    if min(right - left, bottom - top) <= pair.config.patch_size_px:
+        return None
+    window = (left, top, right - left, bottom - top)
+    moving, mask = warp_to_base(pair.image, transform, window=window, scale=scale)
+    reference = downscale(np.ascontiguousarray(pair.base[top:bottom, left:right]), scale)
+    rows, columns = min(moving.shape[0], reference.shape[0]), min(moving.shape[1], reference.shape[1])
+    return moving[:rows, :columns], mask[:rows, :columns], reference[:rows, :columns], (left, top)
 
 
 def _fit_matches(
@@ -251,22 +245,18 @@ def _reselect_inliers(
     source: FloatArray, target: FloatArray, inliers: Mask, model: Model, *, min_sigma_px: float
 ) -> tuple[PolyprojectiveTransform, Mask, float] | Failure:
     """Refit and re-select the points within three robust standard deviations until the set is stable."""
-    for _ in range(20):
+    step = 0
+    while True:
         fit = fit_polyprojective(source[inliers], target[inliers], model=model)
         if isinstance(fit, Failure):
             return fit
-        error = np.nan_to_num(np.linalg.norm(fit(source) - target, axis=1), nan=np.inf)
+        error = np.linalg.norm(fit(source) - target, axis=1)
         # The median of a two-dimensional Gaussian's radius is 1.18 sigma.
-        sigma = float(np.median(error[inliers])) / 1.18
+        sigma = float(np.median(np.nan_to_num(error[inliers], nan=np.inf))) / 1.18
         selected = error < 3.0 * max(sigma, min_sigma_px)
-        if np.array_equal(selected, inliers) or selected.sum() < 12:
-            break
-        inliers = selected
-    fit = fit_polyprojective(source[inliers], target[inliers], model=model)
-    if isinstance(fit, Failure):
-        return fit
-    error = np.linalg.norm(fit(source[inliers]) - target[inliers], axis=1)
-    return fit, inliers, float(error.mean())
+        if step == _RESELECTIONS or np.array_equal(selected, inliers) or selected.sum() < 12:
+            return fit, inliers, float(error[inliers].mean())
+        inliers, step = selected, step + 1
 
 
 def cv_errors(source: FloatArray, target: FloatArray, model: Model) -> FloatArray:

@@ -35,27 +35,10 @@ def match_grid(
     radius_px: int,
     modality: Modality = INTENSITY,
 ) -> GridMatches:
-    """Locate patches of a moving image in a reference image on the same grid.
+    """Locate patches of a moving image (h, w) uint8, valid in a mask, in a reference image on the same grid.
 
-    Parameters
-    ----------
-    moving, mask
-        (h, w) uint8 image and where it is valid.
-    reference
-        (h, w) uint8.
-    spacing_px
-        Spacing of the grid points.
-    patch_px
-        Side of the patches; rounded up to an odd number.
-    radius_px
-        Largest displacement searched. A maximum at the border of the search window is rejected.
-    modality
-        How the images are compared.
-
-    Returns
-    -------
-    GridMatches
-        ``displacement`` points from a position in the moving image to the matching position in the reference.
+    The side of the patches is rounded up to an odd number. Displacements point from a position in the moving image to
+    the matching one in the reference; one of ``radius_px``, at the border of the search window, is rejected.
     """
     half = patch_px // 2
     height, width = reference.shape

@@ -102,25 +102,10 @@ def register_intersensor(
     lens: Lens,
     initial: FloatArray | None = None,
 ) -> IntersensorResult | Failure:
-    """Register a raw frame to another sensor's image.
+    """Register a raw frame (h, w) uint8 to another sensor's image (H, W) uint8.
 
-    Parameters
-    ----------
-    image
-        (h, w) uint8, raw.
-    base
-        (H, W) uint8, the base image.
-    config
-        The base section of the flight's configuration.
-    lens
-        The camera's lens.
-    initial
-        (3, 3) undistorted frame px -> base px, tried first; accurate to a fifth in scale and ten degrees.
-
-    Returns
-    -------
-    IntersensorResult or Failure
-        The failure's reason is one line; each candidate's scores go to this module's logger, at level DEBUG.
+    ``initial`` (3, 3), undistorted frame px -> base px, is tried first; it is accurate to a fifth in scale and ten
+    degrees. A failure's reason is one line; each candidate's scores go to this module's logger, at level DEBUG.
     """
     if float(base.std()) < _MIN_BASE_CONTRAST_GREY:
         return Failure("found an image of one grey level, expected one of the flight's area; give another")

@@ -50,14 +50,7 @@ def is_car(name: str) -> bool:
 def choose_cars(labels: Iterable[Label], names: Mapping[int, str], origin: str) -> tuple[set[Label], list[str]]:
     """The labels that are of cars, and a line that says which these are.
 
-    Parameters
-    ----------
-    labels
-        Class of every annotation.
-    names
-        Names of the classes that are given by number.
-    origin
-        Where the names stand, for the lines.
+    ``labels`` has the class of every annotation, ``names`` of those given by number; they stand in ``origin``.
 
     Raises
     ------

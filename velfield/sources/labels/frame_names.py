@@ -31,12 +31,6 @@ def match_frames(images: Iterable[str], info: SourceInfo) -> tuple[dict[str, str
     ------
     InputError
         A name that may mean several frames, or two images of one frame.
-
-    Examples
-    --------
-    >>> video = SourceInfo("video", 9, 9, 50, np.arange(50) / 25, tuple(str(k) for k in range(50)))
-    >>> match_frames(["DJI_0001_frame2.jpg", "frame_0017_jpg.rf.0ab.jpg"], video)[0]
-    {'DJI_0001_frame2.jpg': '2', 'frame_0017_jpg.rf.0ab.jpg': '17'}
     """
     images = list(dict.fromkeys(images))
     found, notes = _of_video(images, info) if info.kind == "video" else (_of_folder(images, info), [])

@@ -74,14 +74,9 @@ class Labels:
 def read_labels(path: Path | str, info: SourceInfo) -> Labels:
     """Read labels of a source's frames.
 
-    Parameters
-    ----------
-    path
-        CSV with the columns ``frame,x_px,y_px[,orientation_rad,length_px,width_px]`` in raw pixels, ``frame`` a
-        image's file name or a video's 0-based index in the file; a row with ``x_px`` and ``y_px`` empty names a frame
-        without cars. Or a file of another program, or a folder of these (documentation: Label formats).
-    info
-        The source.
+    CSV with the columns ``frame,x_px,y_px[,orientation_rad,length_px,width_px]`` in raw pixels, ``frame`` an image's
+    file name or a video's 0-based index in the file; a row with ``x_px`` and ``y_px`` empty names a frame without cars.
+    Or a file of another program, or a folder of these (documentation: Label formats).
 
     Raises
     ------
@@ -103,17 +98,9 @@ def read_labels(path: Path | str, info: SourceInfo) -> Labels:
 def read_detections(path: Path | str, info: SourceInfo) -> pd.DataFrame:
     """Read another program's detections of a source's frames, used in place of our detector's.
 
-    Parameters
-    ----------
-    path
-        As for `read_labels`; a CSV may have the column ``score``, and others, which are ignored; a line of YOLO may
-        end in a score. Objects that are not cars are left out.
-    info
-        The source. Frames that have no row have no detections.
-
-    Returns
-    -------
-    DataFrame of `RAW_DETECTION_COLUMNS`, in order of frames.
+    Formats as for `read_labels`; a CSV may have the column ``score``, and others, which are ignored; a line of YOLO may
+    end in a score. Objects that are not cars are left out; frames that have no row have no detections. The table of
+    `RAW_DETECTION_COLUMNS` is in order of frames.
 
     Raises
     ------

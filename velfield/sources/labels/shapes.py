@@ -35,8 +35,6 @@ def car_shape(points: Sequence[Point]) -> tuple[float, float, CarShape]:
     >>> x, y, shape = car_shape([(0, 0), (20, 8)])
     >>> x, y, [round(v, 2) for v in shape]
     (10.0, 4.0, [0.0, 19.64, 8.84, nan])
-    >>> car_shape([(0, 0), (20, 0), (20, 8), (0, 8)])[2].length_px
-    20.0
     """
     if len(points) == 1:
         return points[0][0], points[0][1], CarShape()
@@ -53,13 +51,7 @@ def car_shape(points: Sequence[Point]) -> tuple[float, float, CarShape]:
 
 
 def rotated_corners(x: float, y: float, width: float, height: float, clockwise_rad: float) -> list[Point]:
-    """Corners of a box of a width and a height about (x, y), turned clockwise (from +x towards +y) about that centre.
-
-    Examples
-    --------
-    >>> [(round(x), round(y)) for x, y in rotated_corners(0, 0, 20, 8, math.pi / 2)]
-    [(4, -10), (4, 10), (-4, 10), (-4, -10)]
-    """
+    """Corners of a box of a width and a height about (x, y), turned clockwise (from +x towards +y) about its centre."""
     c, s = math.cos(clockwise_rad), math.sin(clockwise_rad)
     half = [(-width / 2, -height / 2), (width / 2, -height / 2), (width / 2, height / 2), (-width / 2, height / 2)]
     return [(x + u * c - v * s, y + u * s + v * c) for u, v in half]
@@ -94,11 +86,6 @@ def tilt_of_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> fl
     """|angle| to the x axis, [0, pi / 2], of a car of a known aspect in an upright box of w x h.
 
     With c, s >= 0 the cosine and the sine, h (c + r s) = w (s + r c).
-
-    Examples
-    --------
-    >>> [round(tilt_of_upright_box(w, h), 2) for w, h in ((20.0, 9.0), (9.0, 20.0), (10.0, 10.0))]
-    [0.0, 1.57, 0.79]
     """
     tilt = math.atan2(h - aspect * w, w - aspect * h)
     return min(max(tilt, 0.0), math.pi / 2)
@@ -109,14 +96,6 @@ def length_from_upright_box(w: float, h: float) -> float:
 
     With L the length, r the aspect, S = |sin 2 theta|: w h = L^2 (r + (1 + r^2) S / 2) and
     w^2 + h^2 = L^2 (1 + r^2 + 2 r S); their quotient gives S, then either gives L.
-
-    Examples
-    --------
-    >>> round(length_from_upright_box(40.0, 18.0), 3)  # along an axis
-    40.0
-    >>> side = 40 * (1 + 0.45) / 2**0.5  # at 45 degrees
-    >>> round(length_from_upright_box(side, side), 3)
-    40.0
     """
     aspect, squares = CAR_ASPECT, w * w + h * h
     quotient = w * h / squares

@@ -106,13 +106,7 @@ def _of_this_size(
 
 
 def parse_xmp(text: str) -> dict[str, float]:
-    """The quantities in an XMP packet.
-
-    Examples
-    --------
-    >>> parse_xmp('<rdf:Description drone-dji:RelativeAltitude="+80.20" drone-dji:GimbalPitchDegree="-90.00"/>')
-    {'pitch_deg': -90.0, 'height_m': 80.2}
-    """
+    """The quantities in an XMP packet."""
     pix4d = _find_properties(_PIX4D_ORIENTATION, text)
     if "pitch_deg" in pix4d:
         pix4d["pitch_deg"] -= 90.0

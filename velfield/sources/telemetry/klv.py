@@ -28,17 +28,10 @@ _ELLIPSOID, _GROUND_ELLIPSOID, _FULL_PITCH, _FULL_ROLL = 75, 78, 90, 91
 
 
 def parse_klv(data: bytes, origin: str, times_s: Mapping[int, float] | None = None) -> Telemetry | Failure:
-    """Telemetry of a stream of local sets.
+    """Telemetry of a stream of local sets; all else in it is skipped.
 
-    Parameters
-    ----------
-    data
-        The stream; what is no local set in it is skipped.
-    origin
-        Where it is from, for messages.
-    times_s
-        Time from the source's first frame, s, of what begins at an offset in the stream, ascending. Without it the
-        stream is taken to begin with the first frame, and times are by the sets' own clock.
+    ``times_s`` has the time from the source's first frame, s, of what begins at an offset in the stream, ascending.
+    Without it the stream is taken to begin with the first frame, and times are by the sets' own clock.
 
     Raises
     ------

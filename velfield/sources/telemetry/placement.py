@@ -15,7 +15,7 @@ from rasterio.warp import transform
 from schemas.arrays import FloatArray, Points
 from schemas.scale import ScaleEstimate
 from velfield.errors import Failure
-from velfield.sources.geo import utm_crs
+from velfield.sources.geo import WGS84_A_M, WGS84_E2, utm_crs
 from velfield.sources.telemetry.attitude import DIAGONAL_35MM
 from velfield.sources.telemetry.telemetry import Telemetry
 
@@ -240,9 +240,9 @@ def metres_per_degree(latitude: float) -> tuple[float, float]:
     [71696, 111229]
     """
     phi = np.radians(latitude)
-    flat = 1 - 0.00669437999014 * np.sin(phi) ** 2
-    east = np.pi / 180 * 6378137.0 / np.sqrt(flat) * np.cos(phi)
-    return float(east), float(np.pi / 180 * 6378137.0 * (1 - 0.00669437999014) / flat**1.5)
+    flat = 1 - WGS84_E2 * np.sin(phi) ** 2
+    east = np.pi / 180 * WGS84_A_M / np.sqrt(flat) * np.cos(phi)
+    return float(east), float(np.pi / 180 * WGS84_A_M * (1 - WGS84_E2) / flat**1.5)
 
 
 def affine_of_pixels(linear: FloatArray, offset: FloatArray) -> tuple[float, float, float, float, float, float]:

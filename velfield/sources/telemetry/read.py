@@ -30,14 +30,7 @@ _ISO6709 = re.compile(r"([-+]\d+(?:\.\d+)?)([-+]\d+(?:\.\d+)?)([-+]\d+(?:\.\d+)?
 
 
 def read_telemetry(source: Path, info: SourceInfo, given: Path | None = None) -> Telemetry | Failure:
-    """The telemetry of a source, from the file given, else from the source itself.
-
-    Parameters
-    ----------
-    source, info
-        The video or folder of images, and its facts.
-    given
-        A file of subtitles, a flight log or MISB KLV.
+    """The telemetry of a video or folder of images, from the file given (`read_telemetry_file`), else from itself.
 
     Raises
     ------

@@ -55,15 +55,7 @@ _ZOOM_OF_ONE = 10_000
 
 
 def parse_srt(text: str, origin: str) -> Telemetry | Failure:
-    """Telemetry of a subtitle file.
-
-    Parameters
-    ----------
-    text
-        Its content: cues ``H:MM:SS,mmm --> H:MM:SS,mmm`` and their lines.
-    origin
-        Where it is from, for messages.
-    """
+    """Telemetry of a subtitle file's text: cues ``H:MM:SS,mmm --> H:MM:SS,mmm`` and their lines."""
     return telemetry_from_cues(_cues(text), origin)
 
 
@@ -85,15 +77,7 @@ def telemetry_from_cues(cues: Iterator[tuple[float, str]], origin: str) -> Telem
 
 
 def parse_cue(text: str) -> dict[str, float]:
-    """The quantities in one subtitle, by their names in `Telemetry`.
-
-    Examples
-    --------
-    >>> parse_cue("[focal_len: 240] [latitude: 52.5] [longtitude: 13.4] [rel_alt: 100.5 abs_alt: 134.1]")
-    {'focal_35mm': 24.0, 'latitude_deg': 52.5, 'longitude_deg': 13.4, 'height_m': 100.5, 'altitude_m': 134.1}
-    >>> parse_cue("HOME(13.1,52.1) 2017.08.05 14:11:51 GPS(13.4,52.5,16) BAROMETER:91.2")["height_m"]
-    91.2
-    """
+    """The quantities in one subtitle, by their names in `Telemetry`."""
     plain, found = _TAG.sub(" ", text), dict[str, float]()
     for name, number, feet in _PAIR.findall(plain):
         if (quantity := _PAIRS.get(name.lower())) is not None:

@@ -95,14 +95,7 @@ def check_standing_gaps(table: pd.DataFrame, xy_m: FloatArray) -> list[str]:
     """Compare how far apart vehicles stand in queues with what their lengths allow; a warning where it cannot be.
 
     Queued vehicles stand 6 to 9 m apart, from middle to middle, whatever the road: feet taken for metres are 20 to 30,
-    metres taken for feet 2 to 3.
-
-    Parameters
-    ----------
-    table
-        ``track_id, time_s``, by track and time.
-    xy_m
-        (n, 2) positions, m.
+    metres taken for feet 2 to 3. The table has ``track_id, time_s``, by track and time, of positions (n, 2), m.
     """
     speed, rows = step_speeds(table, xy_m)
     track = table["track_id"].to_numpy(np.int64)[rows[:, 0]]

@@ -34,11 +34,8 @@ EXPECTED = "CSV with a header, Parquet, or SUMO's FCD"
 def read_columns(path: Path) -> pd.DataFrame:
     """Read the columns of a file of tracks, a row a vehicle and time.
 
-    Returns
-    -------
-    DataFrame
-        The file's own columns; wide rows (DataFromSky, pNEUMA) are unrolled, SUMO's FCD has the columns that its tool
-        ``xml2csv`` gives. Numbers with decimal commas are numbers.
+    They are the file's own; wide rows (DataFromSky, pNEUMA) are unrolled, SUMO's FCD has the columns that its tool
+    ``xml2csv`` gives. Numbers with decimal commas are numbers.
 
     Raises
     ------

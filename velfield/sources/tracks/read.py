@@ -69,17 +69,10 @@ class GivenPositions:
 def read_tracks(
     path: Path, *, fps: float | None = None, unit: Unit | None = None, y_axis: YAxis | None = None
 ) -> GivenPositions:
-    """Read tracks of another program.
+    """Read tracks of another program: CSV with a header, Parquet, or SUMO's FCD; ``.gz`` too.
 
-    Parameters
-    ----------
-    path
-        CSV with a header, Parquet, or SUMO's FCD; ``.gz`` too. `velfield.sources.tracks.formats` lists the formats.
-    fps
-        Frames a second, where the file has frames and no times.
-    unit, y_axis
-        Unit of the positions and where y points, where the columns do not say it; a unit also chooses among the
-        positions of a format that has several.
+    `velfield.sources.tracks.formats` lists the formats. Frames a second, the unit of the positions and where y points
+    are given where the columns do not say it; a unit also chooses among the positions of a format that has several.
 
     Raises
     ------

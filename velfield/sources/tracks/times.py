@@ -21,16 +21,9 @@ _DAY_S, _HOUR_S = 86400.0, 3600.0
 
 
 def to_seconds(series: pd.Series, unit: TimeUnit | None, path: Path) -> tuple[FloatArray, str]:
-    """Times (n,), s from the first on, and how they were read.
+    """Times (n,), s from the first on, of numbers, dates with or without zones or times of day, and how they were read.
 
-    Parameters
-    ----------
-    series
-        A column: numbers, dates with or without zones, times of day.
-    unit
-        Unit of times given as numbers; None: seconds, or since 1970 in the unit that gives a year of today.
-    path
-        The file, for messages.
+    The unit is that of numbers; None: seconds, or since 1970 in the unit that gives a year of today.
 
     Raises
     ------

@@ -2,10 +2,7 @@
 
 A corrupt packet affects every frame decoded after it until the next key frame, in decoding order, which is not the
 order of presentation. So errors are recorded in decoding order, and a frame is classified when the decoder returns it.
-
-Block artefacts of a corrupt bitstream, detected in the decoded frames.
-
-Many decoders (HEVC always, MPEG-4 often) decode flipped bits without logging an error. The result is blocks that the
+Many decoders (HEVC always, MPEG-4 often) decode flipped bits without logging an error: then there are blocks that the
 frame before does not have, in a stream whose frames otherwise follow from each other.
 """
 
@@ -98,14 +95,8 @@ class BlockArtifactDetector:
 # At this level h264 and mpeg4 log "concealing ... errors" for truncated slices, which they log as no error.
 _LEVEL = av.logging.DEBUG
 _CONCEALED = "concealing"
-# Logged for sound files too: side data of cameras, not frames.
-_HARMLESS = (
-    "SEI",
-    "skipping unregistered",
-    "Could not find codec parameters",
-    "timescale not set",
-    "unsupported color",
-)
+_HARMLESS = "SEI", "skipping unregistered", "Could not find codec parameters", "timescale not set", "unsupported color"
+"""Logged for sound files too: side data of cameras, not frames."""
 
 MARGIN = 4
 """The first bytes of a burst often decode without an error: so many frames before the first one are suspect, too."""

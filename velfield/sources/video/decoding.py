@@ -22,7 +22,7 @@ import numpy as np
 from schemas.arrays import GreyImage, IntArray
 from velfield.errors import InputError
 from velfield.parallel import usable_processors
-from velfield.sources.frames import SourceFrame, SourceInfo, unreadable_frame
+from velfield.sources.frames import SourceFrame, SourceInfo
 from velfield.sources.images import Levels, stretch, stretch_levels
 from velfield.sources.quality import FrameFlag
 from velfield.sources.video.corruption import (
@@ -129,20 +129,16 @@ def _read_logged(path: Path, info: SourceInfo, indices: IntArray) -> Iterator[So
             while held and (info.key_frames[index] or index - held[0][0] >= _HELD_FRAMES):
                 if held[0][0] == index:
                     break
-                yield _sound_frame(info, *held.popleft())
+                yield info.frame(*held.popleft())
                 waiting += 1
             if position == indices.size and not held:
                 return
         else:
             if position and position == indices.size and count_errors() == errors:
-                yield from (_sound_frame(info, *one) for one in held)
+                yield from (info.frame(*one) for one in held)
             return
         if position or waiting:
             return  # a frame is lost; else this entry point is none for the decoder, which began later
-
-
-def _sound_frame(info: SourceInfo, index: int, grey: GreyImage) -> SourceFrame:
-    return SourceFrame(index, info.names[index], float(info.times_s[index]), grey, 0, "")
 
 
 def _decode_on_threads(
@@ -329,20 +325,20 @@ def _entry_points(info: SourceInfo, first: int, *, groups_before: int = 0) -> li
 def _source_frame(path: Path, info: SourceInfo, decoded: _Decoded, corruption: CorruptionTracker) -> SourceFrame:
     index, grey, suspect = decoded
     if grey is None:
-        return unreadable_frame(info, index, int(FrameFlag.UNREADABLE), "the decoder returned no image")
+        return info.frame(index, None, int(FrameFlag.UNREADABLE), "the decoder returned no image")
     suspect = suspect or corruption.is_suspect(index)
-    time_s = float(info.times_s[index])
     if grey.shape != info.shape:
         found = f"{grey.shape[1]}x{grey.shape[0]}"
         if suspect:
             flags = int(FrameFlag.UNREADABLE | FrameFlag.SUSPECT)
-            return unreadable_frame(info, index, flags, f"corrupt: decoded as {found}")
+            return info.frame(index, None, flags, f"corrupt: decoded as {found}")
         raise InputError(
-            f"{path.name}: found frame {index} at {time_s:.3f} s of {found}, expected {info.width}x{info.height} "
-            "as the frames before; use --stop-s, or cut the video there"
+            f"{path.name}: found frame {index} at {info.times_s[index]:.3f} s of {found}, expected "
+            f"{info.width}x{info.height} as the frames before; use --stop-s, or cut the video there"
         )
-    reason = f"bitstream corrupt ({corruption.last_error})" if suspect else ""
-    return SourceFrame(index, info.names[index], time_s, grey, int(FrameFlag.SUSPECT) if suspect else 0, reason)
+    if not suspect:
+        return info.frame(index, grey)
+    return info.frame(index, grey, int(FrameFlag.SUSPECT), f"bitstream corrupt ({corruption.last_error})")
 
 
 def video_levels(path: Path, info: SourceInfo) -> Levels | None:

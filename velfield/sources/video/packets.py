@@ -1,7 +1,4 @@
-"""Time stamps of a video's frames by demuxing alone, and their outliers.
-
-Open a video and read its packets, safely and past corrupt ones.
-"""
+"""Open a video, read its packets past corrupt ones, and time stamps of its frames by demuxing alone."""
 
 import itertools
 from collections.abc import Iterator

@@ -161,22 +161,17 @@ def place_street_trees(canvas: Canvas, plan: p.CityPlan, scene: SceneSimulation,
     if not scene.street_tree_share:
         return
     x0, y0, x1, y1 = plan.rect
-    for y in plan.avenues_y:
-        for sign in (-1, 1):
-            for x in _stems((x0, x1), plan.avenues_x, p.STOP_A, scene.street_tree_share, rng):
-                _place_street_tree(canvas, (x, y + sign * (p.CURB_A + rng.uniform(3.0, 4.5))), scene, rng)
-    for x in plan.avenues_x:
-        for sign in (-1, 1):
-            for y in _stems((y0, y1), plan.avenues_y, p.STOP_B, scene.street_tree_share, rng):
-                _place_street_tree(canvas, (x + sign * (p.CURB_B + rng.uniform(3.5, 5.0)), y), scene, rng)
+    roads = [(False, (x0, x1), y, plan.avenues_x, p.STOP_A, p.CURB_A, (3.0, 4.5)) for y in plan.avenues_y]
+    roads += [(True, (y0, y1), x, plan.avenues_y, p.STOP_B, p.CURB_B, (3.5, 5.0)) for x in plan.avenues_x]
     for left, top, right, bottom in plan.streets:
         vertical = right - left < bottom - top
-        along = (top, bottom) if vertical else (left, right)
-        middle = (left + right) / 2 if vertical else (top + bottom) / 2
+        along, across = ((top, bottom), (left, right)) if vertical else ((left, right), (top, bottom))
+        roads.append((vertical, along, sum(across) / 2, [], 0.0, 0.0, (4.5, 6.0)))
+    for vertical, along, middle, crossings, stop_m, curb_m, verge_m in roads:
         for sign in (-1, 1):
-            for at in _stems(along, [], 0.0, scene.street_tree_share, rng):
-                off = middle + sign * rng.uniform(4.5, 6.0)
-                _place_street_tree(canvas, (off, at) if vertical else (at, off), scene, rng)
+            for at in _stems(along, crossings, stop_m, scene.street_tree_share, rng):
+                off = middle + sign * (curb_m + rng.uniform(*verge_m))
+                place_tree(canvas, *((off, at) if vertical else (at, off)), rng.uniform(4.0, 6.0), scene, rng)
 
 
 def _stems(
@@ -193,12 +188,6 @@ def _stems(
             at += rng.uniform(*_TREE_GAP_M)
         at += row * (1 - share) / share * rng.uniform(0.6, 1.4)
     return found
-
-
-def _place_street_tree(
-    canvas: Canvas, at: tuple[float, float], scene: SceneSimulation, rng: np.random.Generator
-) -> None:
-    place_tree(canvas, *at, float(rng.uniform(4.0, 6.0)), scene, rng)
 
 
 def place_tree(
