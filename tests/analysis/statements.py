@@ -11,11 +11,12 @@ from scipy.special import ndtr
 
 from schemas.arrays import FloatArray, IntArray
 from tests.analysis.noisy_tracks import GSD_M, Noise, TrueTracks, analyse, flight, true_numbers
+from tests.benchmarks.analysis import signal_onsets_s
 from velfield.analysis.answers import find_answers
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2
 from velfield.analysis.intervals import Estimate
-from velfield.analysis.movements.movements import JunctionMovements, find_passes
-from velfield.analysis.signals.cycles import JunctionSignal, queues
+from velfield.analysis.movements.movements import JunctionMovements, find_movements, find_passes
+from velfield.analysis.signals.cycles import JunctionSignal, least_green_s, queues
 from velfield.analysis.signals.queues import observe_stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
@@ -126,6 +127,7 @@ def statements(analysis: TrafficAnalysis, truth: Truth, u_turns: tuple[set[int],
     yield from _u_turns(analysis, numbers, *u_turns)
     yield from _limits(analysis, truth)
     yield from _counts(analysis, truth)
+    yield from _delays(analysis, truth)
     yield from _conflicts(analysis, truth, numbers)
     yield from _unusual(analysis, truth, numbers)
     yield from _car_parks(analysis, truth)
@@ -156,11 +158,28 @@ def _signals(analysis: TrafficAnalysis, truth: Truth) -> Iterator[Statement]:
             yield Statement("phases", len(signal.phases) <= 2, f"{name} {len(signal.phases)} phases")
             if has:
                 yield from _queues(signal, truth)
+                yield from _greens(signal, signal.cycle_s.value, truth)
 
 
 def _queues(signal: JunctionSignal, truth: Truth) -> Iterator[Statement]:
     for estimate, n in queue_pairs(signal, truth):
         yield Statement("queue", estimate.low - 1 <= n <= estimate.high + 1, f"queue {estimate}, in truth {n}")
+
+
+def _greens(signal: JunctionSignal, cycle_s: float, truth: Truth) -> Iterator[Statement]:
+    for stream in signal.streams:
+        green, red = signal_onsets_s(truth.flight, stream.stream)
+        seen = least_green_s([stream], cycle_s)
+        yield Statement("least green", seen <= red - green + 1.5, f"{seen:.1f} s, in truth {red - green:.1f}")
+
+
+def _delays(analysis: TrafficAnalysis, truth: Truth) -> Iterator[Statement]:
+    real = find_movements(truth.scene.trajectories, analysis.lanes, names=analysis.arm_names)
+    for found, true in zip(analysis.movements, real, strict=True):
+        for arm, delay in found.delays_s.items():
+            if arm in true.delays_s:
+                value = true.delays_s[arm].value
+                yield Statement("delay", _near(delay, value, 2.0), f"from {arm} {delay}, in truth {value:.1f}")
 
 
 def queue_pairs(signal: JunctionSignal, truth: Truth) -> Iterator[tuple[Estimate, int]]:

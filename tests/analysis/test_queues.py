@@ -7,7 +7,7 @@ import pytest
 
 from tests.analysis.test_traffic_analysis import CYCLE_S, crossroads, gather
 from velfield.analysis.answers import find_answers
-from velfield.analysis.signals.cycles import StreamSignal, queues
+from velfield.analysis.signals.cycles import StreamSignal, least_green_s, queues
 from velfield.analysis.signals.queues import Stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
@@ -77,6 +77,17 @@ def test_a_queue_that_ends_where_the_view_begins_is_a_lower_bound(stream: Stream
     said = {answer.subject: answer.text for answer in find_answers(cut) if answer.topic == "queue"}
     assert "straight on to S (lane 2): at least 4 vehicles" in said[f"junction {junction} from N"]
     assert "straight on to E and right to S (lane 0): 4 vehicles" in said[f"junction {junction} from W"]
+
+
+def test_a_green_lasts_at_least_as_long_as_queues_drive_off() -> None:
+    """The fourth of each queue sets off 5.4 s after the first, and has 21 m more to go; a late car is of no queue."""
+    (found,) = signals_from_the_north(TrafficAnalysis(gather(crossroads())))
+    least = least_green_s([found], CYCLE_S)
+    assert 7.0 < least < 13.0
+    late = np.append(found.stream.cross_time_s, found.green_s[3] + 30.0)
+    assert least_green_s([replace(found, stream=replace(found.stream, cross_time_s=np.sort(late)))], CYCLE_S) == least
+    alone = replace(found, stream=replace(found.stream, cross_time_s=found.green_s + 20.0))
+    assert least_green_s([alone], CYCLE_S) == 0.0
 
 
 def test_where_some_are_hidden_others_may_be_behind_the_last() -> None:

@@ -26,7 +26,8 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
     assert len(answers) == 5
     assert "cycle 40.0 s" in answers["Is there a signal, and is it fair?"]
     assert re.search(
-        r"from W, straight on and right \(lane \d+\): green and yellow for \d+ s, .*, 60 vehicles crossed",
+        r"from W, straight on and right \(lane \d+\): green and yellow for 1[234] s from N, straight on \(lane \d+\): "
+        r"green and yellow for 1[23] s, beginning 20 s after the first",
         answers["Is there a signal, and is it fair?"],
     )
     waits = dict(page.answers)["Which approach waits longest, and how long are the queues?"]
@@ -38,8 +39,10 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
     assert waits[1] == "junction 0: vehicles from N wait longest"
     assert [line.split(";")[0] for line in waits[2:]] == ["from N: 48 vehicles", "from W: 60 vehicles"]
     assert answers["Where do vehicles go?"].startswith("junction 0: 108 of the 108 vehicles were seen to enter it, ")
-    assert answers["Where is it dangerous?"].startswith("nothing dangerous was seen in 8.5 min: ")
-    assert "up to 16 such near misses an hour" in answers["Where is it dangerous?"]
+    assert answers["Where is it dangerous?"].startswith("nothing dangerous was seen in 8.5 min, too short")
+    assert (
+        "a place with 16 such near misses an hour shows none in one of ten films" in answers["Where is it dangerous?"]
+    )
     assert any(line.startswith("classes") for line in page.withheld)
     assert page.sections[-1][0].startswith("What is not known")
 

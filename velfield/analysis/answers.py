@@ -20,7 +20,7 @@ from velfield.analysis.approaches import (
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.movements.movements import MIN_DELAYED, JunctionMovements
-from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s
+from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s, least_green_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import MOVES_M, Trajectories
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
@@ -154,7 +154,7 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
     # Where lanes merge there is no choice.
     found = [m for j in analysis.movements if kinds[j.junction.number] != "merge" for m in j.movements]
     for m in sorted(found, key=lambda m: (not analysis.ways_meet(m.junction), -(m.seen + m.inferred))):
-        share = _share_text(m.share, m.seen + m.inferred, m.arm_in)
+        share = _share_text(m.share, m.arm_in)
         subject = f"{_place(analysis, m.junction)}, {m.arm_in} to {m.arm_out}"
         text = f"{count_text(m.seen + m.inferred, 'vehicle')}{share}"
         yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
@@ -169,7 +169,7 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
     for r in analysis.scene.relations if analysis.scene else ():
         if not r.seen:
             continue  # the table has what is inferred alone
-        share = _share_text(r.share, r.vehicles, r.origin.name)
+        share = _share_text(r.share, r.origin.name)
         text = f"{count_text(r.vehicles, 'vehicle')}, {r.seen} of them tracked all the way{share}"
         yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
 
@@ -185,18 +185,17 @@ def _lanes_without_junction(analysis: TrafficAnalysis) -> Iterator[Answer]:
         yield Answer("other lanes", f"lane {lane.number}", "found", text)
 
 
-def _share_text(share: Estimate | None, vehicles: float, origin: str) -> str:
+def _share_text(share: Estimate | None, origin: str) -> str:
     """What share vehicles are of those that come from an origin; nothing where it is not known.
 
     Examples
     --------
-    >>> _share_text(Estimate(0.888, 0.817, 0.937, 75), 69.2, "N")
-    ', 89 % (82 to 94) of 78 from N'
+    >>> _share_text(Estimate(0.888, 0.817, 0.937, 75), "N")
+    ', 89 % (82 to 94) of those from N'
     """
     if share is None or not share.value:
         return ""
-    part = f"{100 * share.value:.0f} % ({100 * share.low:.0f} to {100 * share.high:.0f})"
-    return f", {part} of {vehicles / share.value:.0f} from {origin}"
+    return f", {100 * share.value:.0f} % ({100 * share.low:.0f} to {100 * share.high:.0f}) of those from {origin}"
 
 
 def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
@@ -232,17 +231,13 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     first_s = None
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
-        lasts = green_duration_s(streams, cycle.value)
-        long = f" and yellow for {lasts:.0f} s" if lasts else ""
-        begins = streams[0].green_phase_s
-        first_s = begins.value if first_s is None else first_s
-        later_s = (begins.value - first_s) % cycle.value
-        after = f", from {later_s:.0f} s after the first began" if later_s else ""
-        crossed = np.unique(np.concatenate([s.stream.cross_track for s in streams]))
-        text += (
-            f"; {_from_arms(analysis, signal.junction, lanes)}green{long}{after}, seen "
-            f"{count_text(begins.n, 'time')}, {count_text(len(crossed), 'vehicle')} crossed"
-        )
+        lasts, least = green_duration_s(streams, cycle.value), least_green_s(streams, cycle.value)
+        long = f" and yellow for {lasts:.0f} s" if lasts else f" and yellow for {least:.0f} s or more" if least else ""
+        begins_s = streams[0].green_phase_s.value
+        first_s = begins_s if first_s is None else first_s
+        later_s = (begins_s - first_s) % cycle.value
+        after = f", beginning {later_s:.0f} s after the first" if later_s else ""
+        text += f"; {_from_arms(analysis, signal.junction, lanes)}green{long}{after}"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 

@@ -17,8 +17,6 @@ from velfield.errors import count_text, list_text
 
 TURNS: dict[Turn, str] = {"straight": "straight on", "left": "left", "right": "right", "u-turn": "back"}
 """Turns for people."""
-_OF_PART = " or more"
-"""Said after a delay of vehicles that come into view when they wait already."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +34,15 @@ class ApproachDelay:
     partly: bool
 
     @property
+    def value_text(self) -> str:
+        """The delay alone: ``25 s or more``."""
+        return f"{self.delay_s.value:.0f} s{' or more' if self.partly else ''}"
+
+    @property
     def text(self) -> str:
-        """The delay and its level, for people."""
+        """The delay, its interval and its level, for people."""
         delay, level = self.delay_s, f", level of service {self.level}" if self.level else ""
-        part = _OF_PART if self.partly else ""
-        return f"{delay.value:.0f} s ({delay.low:.0f} to {delay.high:.0f}, n {delay.n}){part}{level}"
+        return f"{self.value_text} ({delay.low:.0f} to {delay.high:.0f}, n {delay.n}){level}"
 
 
 def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list[ApproachDelay]:
@@ -75,9 +77,9 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
     >>> east = ApproachDelay("E", Estimate(46, 39, 53, 60), "", (), False)
     >>> west = ApproachDelay("W", Estimate(22, 15, 29, 60), "", (), False)
     >>> compare_delays([east, west])
-    'it is not alike for all: vehicles from E wait 24 s (14 to 34) longer than those from W'
+    'not by the waiting times: vehicles from E wait 24 s (14 to 34) longer than those from W'
     >>> compare_delays([west, west])
-    'no approach is shown to wait longer than another: their mean delays are within 0 s'
+    'as far as is shown: no approach waits longer than another, their mean delays are within 0 s'
     >>> compare_delays([west], ["E", "N"])
     'whether it is fair is not known: the delay from E and N is not'
     >>> compare_delays([west, west], ["N"])
@@ -94,10 +96,12 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
     if by_s < reach_s and lacks:
         return f"{lacks}; those from {list_text([d.arm for d in delays])} are within {by_s:.0f} s"
     if by_s < reach_s:
-        return f"no approach is shown to wait longer than another{part}: their mean delays are within {by_s:.0f} s"
+        alike = f"no approach waits longer than another{part}, their mean delays are within {by_s:.0f} s"
+        return f"as far as is shown: {alike}"
+    least = ", who wait least" if len(delays) > 2 else ""
     return (
-        f"it is not alike for all: vehicles from {longest.arm} wait {by_s:.0f} s ({by_s - reach_s:.0f} to "
-        f"{by_s + reach_s:.0f}) longer than those from {shortest.arm}{part}"
+        f"not by the waiting times: vehicles from {longest.arm} wait {by_s:.0f} s ({by_s - reach_s:.0f} to "
+        f"{by_s + reach_s:.0f}) longer than those from {shortest.arm}{least}{part}"
         + (f"; the delay from {list_text(unknown)} is not known" if unknown else "")
     )
 
@@ -135,10 +139,10 @@ def queue_text(queue: Queue) -> str:
     >>> queue_text(Queue(12.0, Estimate(4, 3, 6, 3), 23.4))
     '4 vehicles (3 to 6), 23 m'
     >>> queue_text(Queue(12.0, Estimate(14, 14, 14, 14), 92.0, reaches_edge=True))
-    'at least 14 vehicles over 92 m: where it ends is not seen'
+    'at least 14 vehicles on 92 m; where it ends is not seen'
     """
     n = queue.vehicles
     if queue.reaches_edge:
-        return f"at least {count_text(n.low, 'vehicle')} over {queue.length_m:.0f} m: where it ends is not seen"
+        return f"at least {count_text(n.low, 'vehicle')} on {queue.length_m:.0f} m; where it ends is not seen"
     ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
     return f"{count_text(n.value, 'vehicle')}{ends}, {queue.length_m:.0f} m"

@@ -43,6 +43,8 @@ _START_UP_VEHICLES = 4
 """The first vehicles of a queue lose time at the start (HCM)."""
 _MIN_CROSSINGS = 20
 """An onset of red rests on so many crossings of the line at least."""
+_SETS_OFF_S, _PAUSE_S = 6.0, 4.0
+"""Longest time from green to the first crossing, and between two, of a queue that drives off."""
 _RATE_S, _MIN_RATE_CROSSINGS = 8.0, 3
 """The rate of crossings, of all cycles together, is that of so long before their end; of fewer crossings it is unknown,
 and taken for theirs."""
@@ -391,6 +393,20 @@ def green_duration_s(streams: Sequence[StreamSignal], cycle_s: float) -> float |
     """How long vehicles of the streams of a phase cross, yellow included, s; None where no onset of red is known."""
     lasts = [(s.red_phase_s.value - s.green_phase_s.value) % cycle_s for s in streams if s.red_phase_s]
     return max(lasts, default=None)
+
+
+def least_green_s(streams: Sequence[StreamSignal], cycle_s: float) -> float:
+    """How long queues of the streams of a phase were seen to drive off, s: it is green, or yellow, for longer."""
+    return max((_drives_off_s(s.stream, float(onset), cycle_s) for s in streams for onset in s.green_s), default=0.0)
+
+
+def _drives_off_s(stream: Stream, onset_s: float, cycle_s: float) -> float:
+    """How long after an onset of green vehicles cross without a pause."""
+    after = stream.cross_time_s - onset_s
+    after = after[(after > 0) & (after < cycle_s)]
+    pause = np.diff(after, prepend=0.0) > np.where(np.arange(len(after)), _PAUSE_S, _SETS_OFF_S)
+    together = after[: int(np.argmax(pause)) if pause.any() else len(after)]
+    return float(together.max(initial=0.0))
 
 
 @dataclass(frozen=True)

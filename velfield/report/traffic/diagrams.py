@@ -170,7 +170,7 @@ def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
     for k, delay in enumerate(delays):
         axes.barh(k, delay.delay_s.value, color="#5b6770", height=0.6)
         axes.plot([delay.delay_s.low, delay.delay_s.high], [k, k], color="#1b1f24", linewidth=1.5)
-        label = f"{delay.level}   {delay.delay_s.value:.0f} s, of {delay.delay_s.n} vehicles"
+        label = f"{delay.level}   {delay.value_text}, of {delay.delay_s.n} vehicles"
         axes.text(delay.delay_s.high + 0.01 * top, k, label, va="center", fontsize=9, fontweight="bold",
                   bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
     for letter, low, high in zip("ABCDEF", (0.0, *limits), (*limits, top), strict=False) if limits else ():

@@ -127,7 +127,10 @@ def _entered(analysis: TrafficAnalysis, found: JunctionMovements) -> str:
     by_arm = {m.arm_in: found.entered(m.arm_in) for m in found.movements}
     arms = list_text([f"{n:.0f} from {arm}" for arm, n in sorted(by_arm.items(), key=lambda item: -item[1])])
     of = count_text(len(analysis.trajectories), "vehicle")
-    return f"junction {found.junction.number}: {sum(by_arm.values()):.0f} of the {of} were seen to enter it, {arms}"
+    return (
+        f"junction {found.junction.number}: {sum(by_arm.values()):.0f} of the {of} were seen to enter it, {arms}; the "
+        "others left it, did not reach it or drove elsewhere"
+    )
 
 
 def _waits(
@@ -148,8 +151,11 @@ def _waits(
             f"{place}: the longest queue when green begins is from {by_length[0]}, {lane_text(found, lane)}: "
             f"{queue_text(queue)}{alike}"
         )
+    most = [d.arm for d in delays if d.partly or d.delay_s.high >= delays[0].delay_s.low]
+    first = f"vehicles from {list_text(most)} wait longest" if len(most) < len(delays) else ""
     if unknown:
-        yield f"{place}: which approach waits longest is not known, as the delay from {list_text(unknown)} is not"
+        but = f"; of the others {first}" if first else ""
+        yield f"{place}: which approach waits longest is not known, as the delay from {list_text(unknown)} is not{but}"
     elif len(delays) > 1:
         most = [d.arm for d in delays if d.partly or d.delay_s.high >= delays[0].delay_s.low]
         yield (
@@ -172,11 +178,11 @@ def _danger(answers: list[Answer], duration_s: float) -> Iterator[str]:
     if all(topic in seen and seen[topic].at_most_per_h for topic in ("conflicts", "unusual")):
         most = seen.pop("conflicts").at_most_per_h or 0.0
         del seen["unusual"]
-        short = ", so that this does not show that the place is safe" if most > _SAFE_PER_H else ""
+        short = ", too short a time to call the place safe" if most > _SAFE_PER_H else ""
         yield (
-            f"nothing dangerous was seen in {duration_text(duration_s)}: no two vehicles came within 1.5 s of meeting "
-            f"each other, and none drove against the traffic. There may still be up to {rate_text(most)} such near "
-            f"misses an hour{short}"
+            f"nothing dangerous was seen in {duration_text(duration_s)}{short}: no two vehicles came within 1.5 s of "
+            f"meeting each other, and none drove against the traffic; a place with {rate_text(most)} such near misses "
+            "an hour shows none in one of ten films of this length"
         )
     elif "conflicts" in events and seen and "conflicts" not in seen:
         yield f"near misses: {events['conflicts'].text}"

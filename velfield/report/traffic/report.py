@@ -21,9 +21,12 @@ MAX_ROWS = 400
 _PAGE_IN = (8.27, 11.69)
 DPI = 130
 _TOP_IN, _FOOT_IN = 11.0, 0.4
-_WRAP, _LINE_IN = 118, 0.16
+_WRAP, _LINE_IN = 112, 0.155
 """Characters and height of a line of the answers."""
-BRACKETS = "Numbers in brackets: the 90 % interval, and n, the number of vehicles, cycles or events that it rests on."
+BRACKETS = (
+    "Numbers in brackets: the range in which the true value lies with 90 % probability, and n, the number of vehicles, "
+    "cycles or events that it rests on. Level of service: from A, the best, to F."
+)
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 1.5em auto; max-width: 58em; padding: 0 1em; color: #1b1f24 }
 h1 { line-height: 1.2; margin-bottom: 0.2em } h2 { margin: 1.6em 0 0.3em }
