@@ -87,22 +87,10 @@ class _EdgeData:
         )
 
 
-def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) -> CameraRecord:
-    """Estimate the lens from frames of one camera.
+def calibrate(frames: Sequence[GreyImage], config: LensConfig) -> CameraRecord:
+    """Estimate the lens from grey frames (h, w) uint8 of one camera, of which a dozen spread over the flight suffice.
 
-    Parameters
-    ----------
-    frames
-        (h, w) uint8 grey frames, all of one size; a dozen spread over the flight suffice.
-    config
-        The lens section of the flight's configuration.
-    seed
-        Seed of the cross-validation folds and of the vanishing points.
-
-    Returns
-    -------
-    CameraRecord
-        With the pinhole model, and the reason, if no distortion is significant.
+    The record has the pinhole model, and the reason, if no distortion is significant.
 
     Raises
     ------
@@ -120,12 +108,12 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
     if harris is None:
         reason = f"fewer than {MIN_LINES} lines of sufficient length in {len(frames)} frames"
         return pinhole_record(shape, reason, len(frames))
-    fits, selected, lines, cv_px = _select_model(data, harris, seed)
+    fits, selected, lines, cv_px = _select_model(data, harris)
     bounded = 0 < int(np.argmin(grid_entropy)) < len(grid_a) - 1
     accepted, reason = _decide(data, harris, fits[selected], lines, bounded=bounded)
     accepted = accepted or config.calibrate == "always"
     for number in {0, selected}:
-        fits[number] = refine_by_vanishing_points(fits[number], lines, seed)
+        fits[number] = refine_by_vanishing_points(fits[number], lines)
     candidates = _model_evidence(data, fits, lines, cv_px)
     spread = np.sqrt(np.diag(fits[0].covariance))
     a_sd = SD_INFLATION * float(spread[0])
@@ -212,9 +200,7 @@ def _fit_harris(data: _EdgeData, start: FloatArray) -> PlumbLineFit | None:
     return fit
 
 
-def _select_model(
-    data: _EdgeData, harris: PlumbLineFit, seed: int
-) -> tuple[list[PlumbLineFit], int, LineSet, list[float]]:
+def _select_model(data: _EdgeData, harris: PlumbLineFit) -> tuple[list[PlumbLineFit], int, LineSet, list[float]]:
     """Fit each model; select the simplest that cross-validation cannot distinguish from the best.
 
     Returns the fits, the index of the selected one, the lines, and the cross-validated RMS, px, without a lens and of
@@ -230,7 +216,7 @@ def _select_model(
     lines = data.lines(division.lens, 1.5)
     fits = parallel_map(lambda model: fit_lens(lines, *model), zip(families, starts, strict=True))
     models = [(data.family("harris", 0), np.zeros(3)), *((fit.family, fit.parameters) for fit in fits)]
-    rms = cv_rms(lines, models, folds=_FOLDS, seed=seed)
+    rms = cv_rms(lines, models, folds=_FOLDS)
     rms = np.where(np.isfinite(rms), rms, np.inf)
     # Curved kerbs are straight under no model and must not decide between them.
     straight = rms.min(axis=0) < 3.0 * np.median(rms.min(axis=0))

@@ -190,9 +190,9 @@ def weighted_rms(residuals: FloatArray, point_weight: FloatArray) -> float:
     return float(np.sqrt(np.sum(point_weight * residuals**2) / np.sum(point_weight)))
 
 
-def cv_rms(lines: LineSet, families: Sequence[tuple[LensFamily, FloatArray]], *, folds: int, seed: int) -> FloatArray:
+def cv_rms(lines: LineSet, families: Sequence[tuple[LensFamily, FloatArray]], *, folds: int) -> FloatArray:
     """Cross-validated RMS of each line, (models, lines) px, with the same folds for every model."""
-    fold = np.random.default_rng(seed).permutation(lines.count) % folds
+    fold = np.random.default_rng(0).permutation(lines.count) % folds
     rms = np.zeros((len(families), lines.count))
 
     def validate(part: int) -> None:

@@ -76,15 +76,15 @@ class _FamilyEquations:
         return replace(self.family, point=point / np.linalg.norm(point))
 
 
-def refine_by_vanishing_points(fit: PlumbLineFit, lines: LineSet, seed: int = 0) -> PlumbLineFit:
+def refine_by_vanishing_points(fit: PlumbLineFit, lines: LineSet) -> PlumbLineFit:
     """Combine a plumb-line fit, as a Gaussian prior, with the vanishing points of families of parallel lines.
 
     The fit is unchanged if no frame has a family, if the plumb line is more accurate than parallels can be, or if the
-    model's domain would end within the image. The seed is that of the pairs of lines whose intersections are tried.
+    model's domain would end within the image.
     """
     if float(np.sqrt(fit.covariance[0, 0])) < MIN_RELATIVE_SD * abs(float(fit.parameters[0])):
         return fit
-    families = _find_families(lines, _undistort_lines(lines, fit, fit.parameters), seed)
+    families = _find_families(lines, _undistort_lines(lines, fit, fit.parameters))
     if not families:
         return fit
     prior = np.linalg.inv(fit.covariance)
@@ -125,10 +125,10 @@ def _angles(undistorted: _UndistortedLines, lines: IntArray, points: FloatArray)
     return np.asarray(np.arctan2(np.where(along < 0, -across, across), np.abs(along)))
 
 
-def _find_families(lines: LineSet, undistorted: _UndistortedLines, seed: int) -> list[_Family]:
+def _find_families(lines: LineSet, undistorted: _UndistortedLines) -> list[_Family]:
     """Sequential RANSAC for vanishing points, per frame: intersections of random pairs of lines, scored by length."""
     weight = np.minimum(chord_lengths(lines), _MAX_LENGTH_PX)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     families = []
     for frame in np.unique(lines.frame):
         free = np.flatnonzero(lines.frame == frame)

@@ -37,13 +37,11 @@ class CaseDeletionFit:
     ----------
     transform : the fitted map.
     inliers : (n,) bool, the control points that were not deleted.
-    mean_error_px : their mean error.
     rounds : rounds of deletion.
     """
 
     transform: PolyprojectiveTransform
     inliers: Mask
-    mean_error_px: float
     rounds: int
 
 
@@ -177,9 +175,8 @@ def fit_by_case_deletion(
             return transform
         error = np.linalg.norm(transform(source[inliers]) - target[inliers], axis=1)
         error = np.where(np.isfinite(error), error, np.inf)
-        mean = float(error.mean())
-        if mean <= max_mean_error_px:
-            return CaseDeletionFit(transform, inliers, mean, rounds)
+        if error.mean() <= max_mean_error_px:
+            return CaseDeletionFit(transform, inliers, rounds)
         worst = np.argsort(error)[remaining - max(1, round(drop_fraction * remaining)) :]
         inliers[np.flatnonzero(inliers)[worst]] = False
     return Failure(f"mean error still above {max_mean_error_px} px after {_MAX_ROUNDS} rounds")

@@ -83,7 +83,6 @@ class FineFit:
     source_raw: FloatArray
     target: FloatArray
     inliers: Mask
-    mean_error_px: float
     cv_error_px: float
 
 
@@ -193,9 +192,9 @@ def _fit_matches(
         if isinstance(robust, Failure):
             reason = f"{robust.reason} ({near.size} matches, {near.sum()} near one homography)"
             continue
-        fit, inliers, mean_error_px = robust
+        fit, inliers = robust
         cv_error_px = float(cv_errors(undistorted[inliers], target[inliers], model).mean())
-        candidate = FineFit(pair.transform(fit), model, source_raw, target, inliers, mean_error_px, cv_error_px)
+        candidate = FineFit(pair.transform(fit), model, source_raw, target, inliers, cv_error_px)
         # Second-order terms that do not lower the cross-validated error, or fold the frame's corners, are rejected.
         if is_regular(candidate.transform) and (best is None or cv_error_px < best.cv_error_px):
             best = candidate
@@ -204,7 +203,7 @@ def _fit_matches(
 
 def _fit_robustly(
     source: FloatArray, target: FloatArray, near: Mask, model: Model, scale: float, config: BaseConfig
-) -> tuple[PolyprojectiveTransform, Mask, float] | Failure:
+) -> tuple[PolyprojectiveTransform, Mask] | Failure:
     """The paper's case deletion among the points ``near`` one homography, then inliers re-selected until stable."""
     deletion = fit_by_case_deletion(
         source[near],
@@ -243,7 +242,7 @@ def _near_homography(source: FloatArray, target: FloatArray, unit_px: float) -> 
 
 def _reselect_inliers(
     source: FloatArray, target: FloatArray, inliers: Mask, model: Model, *, min_sigma_px: float
-) -> tuple[PolyprojectiveTransform, Mask, float] | Failure:
+) -> tuple[PolyprojectiveTransform, Mask] | Failure:
     """Refit and re-select the points within three robust standard deviations until the set is stable."""
     step = 0
     while True:
@@ -255,7 +254,7 @@ def _reselect_inliers(
         sigma = float(np.median(np.nan_to_num(error[inliers], nan=np.inf))) / 1.18
         selected = error < 3.0 * max(sigma, min_sigma_px)
         if step == _RESELECTIONS or np.array_equal(selected, inliers) or selected.sum() < 12:
-            return fit, inliers, float(error[inliers].mean())
+            return fit, inliers
         inliers, step = selected, step + 1
 
 

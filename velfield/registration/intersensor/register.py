@@ -71,10 +71,9 @@ class IntersensorResult:
     model : the model of lower cross-validated error.
     source_raw, target, cv_errors_px : (n, 2) raw px, (n, 2) base px, (n,) base px: control points and the
         cross-validated error of each.
-    mean_error_px, cv_error_px : mean distance of the control points from the fit, and cross-validated, base px.
+    cv_error_px : their mean cross-validated error.
     scale, rotation_rad : base px per frame px at the frame's centre, and rotation there, from +x towards +y.
     method : how the coarse candidate was found.
-    scores : the verification of each candidate, in words.
     error_map, error_map_spacing_px : (rows, columns) float32 mean cross-validated error about each node of a grid over
         the base image, base px; NaN where no control point is near. Node (i, j) lies at base (j, i) times the spacing.
     """
@@ -84,12 +83,10 @@ class IntersensorResult:
     source_raw: FloatArray
     target: FloatArray
     cv_errors_px: FloatArray
-    mean_error_px: float
     cv_error_px: float
     scale: float
     rotation_rad: float
     method: str
-    scores: tuple[str, ...]
     error_map: Float32Array
     error_map_spacing_px: int
 
@@ -124,7 +121,7 @@ def register_intersensor(
                 continue  # a town of equal blocks matches another place of its own kind, with up to 0.43 of the patches
             if not verification.is_certain and pair.flipped.matrix is not None:
                 break  # straight roads match their own mirror image well enough to pass the verification
-            return _to_result(pair, fit, candidate, tuple(scores))
+            return _to_result(pair, fit, candidate)
     return Failure(_explain_failure(pair, scores))
 
 
@@ -250,7 +247,7 @@ def _estimate_row_motion(fit: FineFit, raw: FloatArray, *, min_distance_px: floa
     return motion
 
 
-def _to_result(pair: ImagePair, fit: FineFit, candidate: CoarseCandidate, scores: tuple[str, ...]) -> IntersensorResult:
+def _to_result(pair: ImagePair, fit: FineFit, candidate: CoarseCandidate) -> IntersensorResult:
     source_raw, target = fit.source_raw[fit.inliers], fit.target[fit.inliers]
     errors = cv_errors(pair.lens.undistort_points(source_raw), target, fit.model)
     scale, rotation = fit.transform.scale_and_rotation()
@@ -261,12 +258,10 @@ def _to_result(pair: ImagePair, fit: FineFit, candidate: CoarseCandidate, scores
         source_raw=source_raw,
         target=target,
         cv_errors_px=errors,
-        mean_error_px=fit.mean_error_px,
         cv_error_px=float(errors.mean()),
         scale=scale,
         rotation_rad=rotation,
         method=candidate.method,
-        scores=scores,
         error_map=_map_errors(target, errors, (pair.base.shape[0], pair.base.shape[1]), spacing),
         error_map_spacing_px=spacing,
     )

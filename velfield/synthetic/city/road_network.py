@@ -71,12 +71,12 @@ class RoadNetwork:
         self.nodes.append(Node(x, y, direction))
         return len(self.nodes) - 1
 
-    def straight(self, a: int, b: int, kind: EdgeKind, speed: float, *, signal: int = -1, weight: float = 1.0) -> None:
+    def straight(self, a: int, b: int, kind: EdgeKind, speed: float, *, signal: int = -1) -> None:
         """Add a straight edge from node ``a`` to node ``b``."""
         p, q = self.nodes[a], self.nodes[b]
         n = max(int(np.hypot(q.x - p.x, q.y - p.y) / STEP_M), 2)
         path = np.column_stack([np.linspace(p.x, q.x, n + 1), np.linspace(p.y, q.y, n + 1)])
-        self.edges.append(Edge(a, b, kind, path, speed, weight, signal))
+        self.edges.append(Edge(a, b, kind, path, speed, 1.0, signal))
 
     def turn(self, a: int, b: int, *, weight: float, speed: float | None = None, yields: bool = True) -> None:
         """Add a curved edge from node ``a`` to node ``b``, tangent to both, its speed limited by lateral
@@ -148,7 +148,7 @@ class Lane:
         numbers = [self._cuts[s] for s in sorted(self._cuts)]
         for a, b in pairwise(numbers):
             kind: EdgeKind = "box" if a in self._boxes else self._kind
-            self._net.straight(a, b, kind, self._speed, signal=self._boxes.get(b, -1), weight=1.0)
+            self._net.straight(a, b, kind, self._speed, signal=self._boxes.get(b, -1))
 
 
 def smooth_curve(a: Node, b: Node) -> FloatArray:
