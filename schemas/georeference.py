@@ -93,7 +93,6 @@ class FlightStart(Model):
     source: str
     """Where it was read, for people."""
     is_utc: bool
-
     """Whether the clock is UTC by its format; a camera's own clock mostly shows local time."""
 
     @property

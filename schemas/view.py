@@ -35,7 +35,6 @@ class ViewArray(Model):
 
     store: str
     """Path of the store in the run folder."""
-
     chunk: tuple[PositiveInt, PositiveInt]
     """(height, width) of a chunk, px."""
     stored: tuple[NonNegativeInt, ...]

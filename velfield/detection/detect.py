@@ -65,18 +65,14 @@ and kept detections make tracklets: precision 0.984 with all kept, 0.988 without
 
 @dataclass(frozen=True)
 class FrameDetections(Detections):
-    """Cars of a frame, and their patches.
-
-    Attributes
-    ----------
-    patches : (n, 16, 8) uint8, rotated to the axis.
-    chips : (n, 32, 32) uint8, upright about the rounded position.
-    strips : (n, 32, 10) uint8, rotated to the axis, at half the resolution.
-    """
+    """Cars of a frame, and their patches."""
 
     patches: GreyImage
+    """(n, 16, 8) uint8, rotated to the axis."""
     chips: GreyImage
+    """(n, 32, 32) uint8, upright about the rounded position."""
     strips: GreyImage
+    """(n, 32, 10) uint8, rotated to the axis, at half the resolution."""
 
     def select(self, mask: Mask) -> "FrameDetections":
         """The cars of a mask (n,)."""
@@ -128,20 +124,14 @@ def attach_crops(
 
 @dataclass(frozen=True)
 class SearchedFrame:
-    """A frame and the cars found in it.
-
-    Attributes
-    ----------
-    frame : the frame.
-    detections : its cars.
-    searched : fraction of the frame's cells that the detector was run on.
-    weak : candidates of a lower score that no car covers.
-    """
+    """A frame and the cars found in it."""
 
     frame: SearchableFrame
     detections: Detections
     searched: float
+    """Fraction of the frame's cells that the detector was run on."""
     weak: Detections = field(default_factory=lambda: concatenate([]))
+    """Candidates of a lower score that no car covers."""
 
     @cached_property
     def slope(self) -> Float32Array:

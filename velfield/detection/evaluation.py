@@ -30,19 +30,16 @@ _PLATEAU = 0.985
 
 @dataclass(frozen=True)
 class HeldOutScores:
-    """Detections on images, or regions of them, that a detector was not trained on.
-
-    Attributes
-    ----------
-    score, correct : (n,) of each detection, and whether it is matched to a labelled car.
-    car_count : labelled cars there.
-    complete : whether every car is labelled, so that an unmatched detection is a false positive.
-    """
+    """Detections on images, or regions of them, that a detector was not trained on."""
 
     score: FloatArray
+    """(n,) of each detection."""
     correct: Mask
+    """(n,) whether it is matched to a labelled car."""
     car_count: int
+    """Labelled cars there."""
     complete: bool
+    """Whether every car is labelled, so that an unmatched detection is a false positive."""
 
 
 def held_out_half(sample: LabelledImage) -> Mask:

@@ -47,15 +47,11 @@ def half_resolution(image: GreyImage) -> GreyImage:
 
 @dataclass(frozen=True, eq=False)
 class ComparableFrame:
-    """A frame on the working grid, computed whole.
-
-    Attributes
-    ----------
-    image, valid : (h, w) uint8 and bool, where the frame covers the grid.
-    """
+    """A frame on the working grid, computed whole."""
 
     image: GreyImage
     valid: Mask
+    """(h, w) where the frame covers the grid."""
 
     @cached_property
     def half_image(self) -> GreyImage:

@@ -25,25 +25,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Detections:
-    """Cars of an image, in no order.
-
-    Attributes
-    ----------
-    xy : (n, 2) float64, working px.
-    orientation_rad : (n,) axial, [0, pi), from +x towards +y (down).
-    orientation_sd_rad : (n,) its standard deviation.
-    area_px : (n,) working px^2.
-    score : (n,) above the score threshold.
-    sizes : (n, 4) length and width, working px, and the standard deviations of their logarithms; NaN where the detector
-        does not measure them.
-    """
+    """Cars of an image, in no order."""
 
     xy: FloatArray
+    """(n, 2) float64, working px."""
     orientation_rad: FloatArray
+    """(n,) axial, [0, pi), from +x towards +y (down)."""
     orientation_sd_rad: FloatArray
+    """(n,) its standard deviation."""
     area_px: FloatArray
+    """(n,) working px^2."""
     score: FloatArray
+    """(n,) above the score threshold."""
     sizes: FloatArray
+    """(n, 4) length and width, working px, and the standard deviations of their logarithms; NaN where the detector does
+    not measure them."""
 
     @classmethod
     def from_rows(cls, rows: FloatArray, area_px: FloatArray, sizes: FloatArray | None = None) -> "Detections":

@@ -23,20 +23,16 @@ CROP_UNIT_PX = 16
 
 @dataclass(frozen=True)
 class Mosaic:
-    """Boxes with context, side by side.
-
-    Attributes
-    ----------
-    shape : (height, width), px.
-    numbers : (n,) of the boxes, in the order of the crops.
-    crops : (n, 4) where they lie: first row, first column, height and width.
-    corners : (n, 2) first row and column of what they show of the frame.
-    """
+    """Boxes with context, side by side."""
 
     shape: tuple[int, int]
+    """(height, width), px."""
     numbers: IntArray
+    """(n,) of the boxes, in the order of the crops."""
     crops: IntArray
+    """(n, 4) where they lie: first row, first column, height and width."""
     corners: IntArray
+    """(n, 2) first row and column of what they show of the frame."""
 
 
 def pack_boxes(boxes: IntArray, context_px: int) -> list[Mosaic]:

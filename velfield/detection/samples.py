@@ -13,24 +13,20 @@ def _no_circles() -> FloatArray:
 
 @dataclass(frozen=True)
 class LabelledImage:
-    """An image on the working grid, and the cars that are known in it.
-
-    Attributes
-    ----------
-    image : (h, w) uint8.
-    cars : (n, 5): x, y, orientation, length, width in working px; NaN where the label has none.
-    ignore : (k, 3): x, y, radius of objects that are neither car nor background.
-    valid : (h, w) bool, none: everywhere.
-    complete : whether every car is labelled, so that all else is background.
-    abs_box_angle_rad : (n,) of cars without an orientation |angle| to the rows, from an upright box; NaN without one.
-    """
+    """An image on the working grid, and the cars that are known in it."""
 
     image: GreyImage
+    """(h, w) uint8."""
     cars: FloatArray
+    """(n, 5): x, y, orientation, length, width in working px; NaN where the label has none."""
     ignore: FloatArray = field(default_factory=_no_circles)
+    """(k, 3): x, y, radius of objects that are neither car nor background."""
     valid: Mask | None = None
+    """(h, w) bool, none: everywhere."""
     complete: bool = True
+    """Whether every car is labelled, so that all else is background."""
     abs_box_angle_rad: FloatArray | None = None
+    """(n,) of cars without an orientation |angle| to the rows, from an upright box; NaN without one."""
 
 
 def restrict_to_region(sample: LabelledImage, region: Mask) -> LabelledImage:

@@ -52,20 +52,16 @@ Window = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class _Finds:
-    """Detections at one scale.
-
-    Attributes
-    ----------
-    count : of any size.
-    agreement : mean of the highest scores times the fraction that has the size of a car.
-    density : sum of the scores of those of the size of a car, per megapixel; 0 of fewer than `_MIN_COUNTED`.
-    length_px : (n,) of those of the size of a car.
-    """
+    """Detections at one scale."""
 
     count: int
+    """Of any size."""
     agreement: float
+    """Mean of the highest scores times the fraction that has the size of a car."""
     density: float
+    """Sum of the scores of those of the size of a car, per megapixel; 0 of fewer than `_MIN_COUNTED`."""
     length_px: FloatArray
+    """(n,) of those of the size of a car."""
 
     @property
     def is_enough(self) -> bool:

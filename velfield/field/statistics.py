@@ -269,14 +269,8 @@ def _tile(
 ) -> None:
     """Fill ``out`` where vehicles passed.
 
-    Parameters
-    ----------
-    variance_bins2
-        (ty, tx) mean measurement variance of a track's velocity component.
-    stationary
-        Speed below which there is no direction, bins.
-    sigma
-        Standard deviation of the histogram's kernel, bins.
+    ``variance_bins2``: (ty, tx), mean, of the measurement of a track's velocity component. ``stationary``: speed below
+    which there is no direction, ``sigma``: standard deviation of the histogram's kernel, bins.
     """
     reach = (histogram.shape[2] - 1) // 2
     cells = np.zeros(max_cells(reach))

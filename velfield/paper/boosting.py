@@ -26,16 +26,12 @@ _TRIM_EVERY, _TRIMMED_WEIGHT = 10, 0.01
 
 @dataclass(frozen=True)
 class FeaturePool:
-    """Random features: for each some positive and negative rectangles.
-
-    Attributes
-    ----------
-    table : (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
-    starts : (features + 1,) int32: the rectangles of feature k are ``starts[k]:starts[k + 1]``.
-    """
+    """Random features: for each some positive and negative rectangles."""
 
     table: Int32s
+    """(r, 5) int32: sign, x0, y0, x1, y1 from the centre."""
     starts: Int32s
+    """(features + 1,) int32: the rectangles of feature k are ``starts[k]:starts[k + 1]``."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -72,17 +68,14 @@ def _draw_interval(sigma: float, reach: int, rng: np.random.Generator) -> tuple[
 
 @dataclass(frozen=True)
 class StumpSelection:
-    """The stumps of a training: for each round the feature, its threshold, and the leaves at or below and above it.
-
-    Attributes
-    ----------
-    features, thresholds : (rounds,) int64 indices into the pool, float32.
-    leaves : (rounds, 2) float32.
-    """
+    """The stumps of a training: for each round the feature, its threshold, and the leaves at or below and above it."""
 
     features: IntArray
+    """(rounds,) indices into the pool."""
     thresholds: Float32Array
+    """(rounds,)"""
     leaves: Float32Array
+    """(rounds, 2) float32."""
 
 
 def boost(

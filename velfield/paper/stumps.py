@@ -14,22 +14,16 @@ Int32s = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class BoostedStumps:
-    """A boosted classifier as arrays, for the kernels.
-
-    Attributes
-    ----------
-    rectangles
-        (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
-    starts
-        (rounds + 1,) int32: the rectangles of round k are ``starts[k]:starts[k + 1]``.
-    thresholds, leaves
-        (rounds,) and (rounds, 2) float32: what a round adds to the score at or below its threshold, and above.
-    """
+    """A boosted classifier as arrays, for the kernels."""
 
     rectangles: Int32s
+    """(r, 5) int32: sign, x0, y0, x1, y1 from the centre."""
     starts: Int32s
+    """(rounds + 1,) int32: the rectangles of round k are ``starts[k]:starts[k + 1]``."""
     thresholds: Float32Array
+    """(rounds,)"""
     leaves: Float32Array
+    """(rounds, 2) what a round adds to the score at or below its threshold, and above."""
 
     @classmethod
     def from_rounds(cls, rounds: Sequence[Round]) -> "BoostedStumps":

@@ -92,13 +92,7 @@ def read_first_georeference(layout: RunLayout) -> GeoreferenceRecord | None:
 
 
 def _read(path: Path, model: type[R]) -> R:
-    """A record of the run folder.
-
-    Raises
-    ------
-    InputError
-        It is not there yet.
-    """
+    """A record of the run folder, which is refused where it is not there yet."""
     if not path.exists():
         raise InputError(f"{path} does not exist: run `velfield run` on this folder first")
     found: R = _parse(model, path.read_bytes())

@@ -333,13 +333,7 @@ class Run:
 
 
 def _points(xy: Points) -> Points:
-    """Points as (n, 2); a single one may be (2,).
-
-    Raises
-    ------
-    ValueError
-        They have another shape.
-    """
+    """Points as (n, 2); a single one may be (2,). ValueError: they have another shape."""
     points = np.asarray(xy, np.float64)
     if points.size and points.shape[-1] != 2:
         raise ValueError(f"found points of shape {points.shape}, expected (n, 2): x and y of each")

@@ -217,9 +217,8 @@ def _displacements(
     links, where = np.unique(keys, return_inverse=True)  # a link that two tracklets share is aligned once
     window, first, second = links // size**2, links // size % size, links % size
     displacement = np.zeros((len(links), 4))
-    crops: dict[
-        int, UprightCrops | None
-    ] = {}  # of the two frames of a link: what is prepared of them is kept for the next
+    # Of the two frames of a link: what is prepared of them is kept for the next.
+    crops: dict[int, UprightCrops | None] = {}
     for i in map(int, np.unique(window)):
         rows = window == i
         crops = {k: crops[k] if k in crops else tables[k].upright_crops() if refine else None for k in (i, i + 1)}

@@ -217,9 +217,7 @@ def _cost_of_looks(before: FloatArray, after: FloatArray) -> FloatArray:
 def _assign(pairs: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
     """Select the candidate pairs (m, 2) of the greatest total gain, each end with at most one start and the reverse.
 
-    Returns
-    -------
-    (k, 2) pairs, and (k,) by how much the total would be less without each.
+    Returns (k, 2) pairs, and (k,) by how much the total would be less without each.
     """
     pairs, gain = pairs[gain > 0], gain[gain > 0]
     if not len(pairs):

@@ -244,8 +244,6 @@ def _to_bytes(values: FloatArray, levels: _Levels) -> GreyImage:
 def _cut(start: float, step: float, count: int) -> tuple[int, int, float, float] | None:
     """The part of a tile's side that ``count`` map pixels of ``step`` tile px from ``start`` on cover.
 
-    Returns
-    -------
     First and last + 1 tile px; offset and length of the same in map pixels. None where they do not meet.
     """
     low, high = max(math.floor(start), 0), min(math.ceil(start + step * count), TILE_PX)

@@ -119,16 +119,12 @@ LAYERS = convolutions(TOPOLOGY) | {SIZE_LAYER.name: SIZE_LAYER}
 
 @dataclass(frozen=True)
 class Network:
-    """Weights of a trained network: of `TOPOLOGY`, and perhaps of `SIZE_LAYER`.
-
-    Attributes
-    ----------
-    weights : by layer, float32 (kernel taps, channels in, channels out).
-    biases : by layer, float32 (channels out,).
-    """
+    """Weights of a trained network: of `TOPOLOGY`, and perhaps of `SIZE_LAYER`."""
 
     weights: Mapping[str, Float32Array]
+    """By layer, float32 (kernel taps, channels in, channels out)."""
     biases: Mapping[str, Float32Array]
+    """By layer, float32 (channels out,)."""
 
     @property
     def measures(self) -> bool:

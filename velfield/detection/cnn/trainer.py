@@ -37,22 +37,18 @@ Backward: TypeAlias = Callable[[Float32Array], Float32Array]
 
 @dataclass(frozen=True)
 class Batch:
-    """Images of one training step and their targets.
-
-    Attributes
-    ----------
-    images : (n, h, w) grey in [0, 1].
-    heatmap : (n, h / 2, w / 2) 1 at a car's centre, a Gaussian around it.
-    mask : (n, h / 2, w / 2) 1 where the heatmap is known, else 0.
-    orientation : (n, h / 2, w / 2, 2) cosine and sine of twice the orientation.
-    orientation_weight : (n, h / 2, w / 2) weight of the orientation in the loss.
-    """
+    """Images of one training step and their targets."""
 
     images: Float32Array
+    """(n, h, w) grey in [0, 1]."""
     heatmap: Float32Array
+    """(n, h / 2, w / 2) 1 at a car's centre, a Gaussian around it."""
     mask: Float32Array
+    """(n, h / 2, w / 2) 1 where the heatmap is known, else 0."""
     orientation: Float32Array
+    """(n, h / 2, w / 2, 2) cosine and sine of twice the orientation."""
     orientation_weight: Float32Array
+    """(n, h / 2, w / 2) weight of the orientation in the loss."""
 
     def halves(self) -> "tuple[Batch, Batch]":
         """The first and the second half of the images."""
@@ -81,14 +77,10 @@ def _positive_weight(batch: Batch) -> Float32Array:
 
 @dataclass
 class Trainer:
-    """Parameters of a network in training, and the state of the optimiser.
-
-    Attributes
-    ----------
-    parameters : by name: ``LAYER.w`` and ``LAYER.b``.
-    """
+    """Parameters of a network in training, and the state of the optimiser."""
 
     parameters: dict[str, Float32Array]
+    """By name: ``LAYER.w`` and ``LAYER.b``."""
     _moments: dict[str, tuple[Float32Array, Float32Array]] = field(default_factory=dict)
     _steps: int = 0
 

@@ -18,19 +18,16 @@ _PAD = 114
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes of an image, in no order.
-
-    Attributes
-    ----------
-    xy, size : (n, 2) centre, and length along and width across ``angle_rad``, px.
-    angle_rad : (n,) from +x towards +y; 0 of upright boxes.
-    score : (n,) in [0, 1].
-    """
+    """Boxes of an image, in no order."""
 
     xy: FloatArray
+    """(n, 2) centre, px."""
     size: FloatArray
+    """(n, 2) length along and width across ``angle_rad``, px."""
     angle_rad: FloatArray
+    """(n,) from +x towards +y; 0 of upright boxes."""
     score: FloatArray
+    """(n,) in [0, 1]."""
 
     def take(self, rows: IntArray) -> "Boxes":
         """Some of them, in the order given."""
