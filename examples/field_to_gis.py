@@ -9,13 +9,14 @@ import rasterio
 
 import velfield
 from velfield.exports.export import export_run
+from velfield.sources.geo import ignore_missing_georeference
 
 
 def main(root: str) -> None:
     """Write both into the run's `exports/`; print the layers of the GeoTIFF."""
     run = velfield.open_run(root)
     layers, lines = export_run(run, "cog"), export_run(run, "geoparquet")
-    with rasterio.open(layers) as image:
+    with ignore_missing_georeference(), rasterio.open(layers) as image:
         print(f"{layers}: {', '.join(image.descriptions)}")
     print(lines)
 

@@ -23,7 +23,6 @@ from rich.progress import (
 )
 
 from velfield.parallel import subscribe_steps
-from velfield.pipeline.result import subscribe
 
 _LINE_EVERY_S = 10.0
 _TRAINS = "detector"
@@ -55,8 +54,7 @@ class StageProgress:
     def set_progress(self, done: int, total: int) -> None:
         """Set the progress to at least so many steps of a number that was not known before."""
         if total != self.total:
-            self.total = total
-            self.bar.update(self.task, total=total)
+            self.expect(total)
         self.at_least(done)
 
     def at_least(self, done: int) -> None:
@@ -96,17 +94,11 @@ class StageBars:
         self.stages[name] = StageProgress(self.bar, self.bar.add_task(label, total=None), log)
         return self.stages[name]
 
-    def add_training_steps(self, done: int, announced: int) -> None:
-        """Count steps of the training of a detector, whose number is announced as it goes on."""
-        progress = self.stages.get(_TRAINS)
+    def add_steps(self, done: int, announced: int, stage: str) -> None:
+        """Count steps that work in this process published; of a training their number is announced as it goes on."""
+        progress = self.stages.get(stage or _TRAINS)
         if progress is not None:
             progress.set_progress(progress.done + done, progress.total + announced)
-
-    def add_steps(self, stage: str, steps: int) -> None:
-        """Count steps that a block of this process published."""
-        progress = self.stages.get(stage)
-        if progress is not None:
-            progress.at_least(progress.done + steps)
 
 
 def print_with_time(text: str) -> None:
@@ -172,7 +164,7 @@ class Console:
             yield progress
 
     @contextmanager
-    def stages(self) -> Iterator["StageBars"]:
+    def stages(self) -> Iterator[StageBars]:
         """Progress bars of the stages that run."""
         columns = (
             TextColumn("{task.description:<12}"),
@@ -184,5 +176,5 @@ class Console:
         hidden = not self._rich.is_terminal  # in a log a bar would leave empty lines
         with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5, disable=hidden) as bar:
             bars = StageBars(bar, partial(self.event, "progress") if hidden else None)
-            with subscribe(bars.add_steps), subscribe_steps(bars.add_training_steps):
+            with subscribe_steps(bars.add_steps):
                 yield bars

@@ -1,4 +1,4 @@
-"""The whole job: all stages of one flight as a flow.
+"""The whole job: all stages of one flight, or those after the tracks of another program, as a flow.
 
 The stages and their order stand in ``velfield.pipeline.stage``. A task is thin glue: it asks
 ``velfield.pipeline.graphs`` for the Dask graph of its unit and computes it on the runner. What is finished is known
@@ -8,7 +8,7 @@ far. The report is written last, from the summary of all stages, by every run: i
 and it takes a moment.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -24,32 +24,29 @@ from schemas.summary import RunSummary
 from velfield.errors import InputError
 from velfield.pipeline.check_inputs import validate_inputs
 from velfield.pipeline.estimate import check_space, disk_full_as_input_error
-from velfield.pipeline.plan import Plan, changed_since, dropped_inputs, make_plan, write_flight_record
+from velfield.pipeline.plan import (
+    Plan,
+    changed_since,
+    check_folder,
+    dropped_inputs,
+    make_plan,
+    write_flight_record,
+)
 from velfield.pipeline.summary import summarise_run
 from velfield.run.commits import remove_analysis, sweep_partial
 from velfield.run.layout import RunLayout, is_remote, remove_tree
 from velfield.run.lock import locked
 
 
-def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
-    """Process a flight: the flow below, with as many concurrent units as the runner can use.
+def run_flight(job: Job, runner: RunnerConfig, console: Console, *, of_tracks: bool = False) -> RunSummary:
+    """Process a flight, or tracks: one of the flows below, with as many concurrent units as the runner can use.
 
     Raises
     ------
     InputError
         The inputs or the configuration are not usable; committed units are kept.
     """
-    return run_flow(process_flight, "process-flight", job, runner, console)
-
-
-def run_flow(
-    flow: Callable[[Job, RunnerConfig, Console, Orchestration], RunSummary],
-    name: str,
-    job: Job,
-    runner: RunnerConfig,
-    console: Console,
-) -> RunSummary:
-    """Run a flow of one job with as many concurrent units as the runner can use."""
+    flow, name = (process_tracks, "process-tracks") if of_tracks else (process_flight, "process-flight")
     by = choose_orchestration()
     return by.run(
         lambda: flow(job, runner, console, by),
@@ -73,6 +70,24 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console, by: Orchest
         # Not before: what it loads would take the interpreter from planning, which the first frame waits for.
         with open_runner(runner, console.warn) as where, disk_full_as_input_error(plan):
             return _run_stages(plan, where, parallel_units(runner), console, by)
+
+
+def process_tracks(job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:
+    """Tracks of another program in, velocity field out: the stages after the tracks, on a run folder without frames."""
+    from velfield.pipeline.given_tracks.plan import plan_tracks  # seconds, which a run on frames need not await
+
+    check_folder(Path(job.root))
+    plan = plan_tracks(job)  # refuses bad tracks before the folder is there
+    layout = RunLayout(Path(job.root))
+    with locked(layout, stop_lost), open_runner(runner, console.warn) as where:
+        by.mark_killed(absolute(job.root))
+        sweep_partial(layout.root)
+        record_start(plan, f"tracks over {plan.frame_count} times, {where.description}", console)
+        work = Work(plan, where, console, by, at_once=parallel_units(runner))
+        work.run()
+        summary = RunSummary(root=job.root, stages=tuple(work.summaries))
+        publish_report(work.plan, summary, where, console, by)
+    return summary
 
 
 @contextmanager

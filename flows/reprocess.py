@@ -20,7 +20,7 @@ from schemas.job import Inputs, Job, absolute
 from schemas.records import RebaseRecord
 from schemas.summary import RunSummary
 from velfield.errors import Failure, InputError
-from velfield.pipeline.plan import write_flight_record
+from velfield.pipeline.plan import job_of, write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, NewBase, stages_before
 from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
 from velfield.pipeline.summary import summarise_run
@@ -111,11 +111,9 @@ def _new_job(run: Run, name: str, base: str) -> Job:
         )
     if set(run.record.keys) != set(STAGE):
         raise InputError(f"{run.layout.root} was made by another version of velfield; run `velfield run` on it again")
-    given = run.record.given
-    if given is None:
-        raise InputError(f"{run.layout.root} has no record of its inputs; run `velfield run` on it again")
-    inputs = Inputs.model_validate(given.model_dump() | {"base": base})
-    return Job(root=str(staging_layout(run.layout, name).root), inputs=inputs, config=run.record.config)
+    job = job_of(run.layout, run.record)
+    inputs = Inputs.model_validate(job.inputs.model_dump() | {"base": base})
+    return job.model_copy(update={"root": str(staging_layout(run.layout, name).root), "inputs": inputs})
 
 
 def _registered(

@@ -290,7 +290,8 @@ def _say_lost_worker(event: tuple[float, Any], warn: Callable[[str], None]) -> N
     if not isinstance(found, dict) or found.get("action") != "remove-worker" or found["expected"]:
         return
     if found["processing-tasks"] or found["lost-computed-tasks"]:
-        warn(f"worker {found['worker']} ended, or was lost: its work is computed again on another")
+        limit = "unless it has ended too many workers"  # then Dask gives it up, of which the event does not tell
+        warn(f"worker {found['worker']} ended, or was lost: its work is computed again on another, {limit}")
 
 
 def _load_stages(client: Any) -> None:

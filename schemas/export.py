@@ -1,37 +1,13 @@
 """The formats that a finished run is exported in, and what some of them ask for."""
 
 from datetime import datetime
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from pydantic import Field
 
 from schemas.model import Model
 
-ExportFormat = Literal[
-    "cog",
-    "geoparquet",
-    "gpkg",
-    "geotrax",
-    "sumo",
-    "arrows",
-    "stac",
-    "direction",
-    "speed",
-    "report",
-    "video",
-    "poster",
-    "sumo_network",
-    "opendrive",
-    "highd",
-    "trajectories",
-    "turning_counts",
-    "utdf",
-    "signal_events",
-    "moving_features",
-    "ssam",
-]
-"""Each is a module of the same name, in a package of `velfield.exports`."""
-EXPORT_FORMATS: dict[ExportFormat, str] = {
+EXPORT_FORMATS: dict[str, str] = {
     "cog": "the field's layers as GeoTIFF",
     "geoparquet": "tracklets as lines, as Parquet",
     "gpkg": "tracklets as lines, as GeoPackage",
@@ -54,7 +30,9 @@ EXPORT_FORMATS: dict[ExportFormat, str] = {
     "video": "the stabilised clip with vehicles, speeds and the field, as MP4",
     "poster": "both maps on a sheet with legend, scale, north, n and date, as PDF or SVG",
 }
-"""Format -> what it holds, for the command's help."""
+"""Format -> what it holds, for the command's help; each is a module of the same name, in a package of
+`velfield.exports`."""
+ExportFormat: TypeAlias = Literal[tuple(EXPORT_FORMATS)]  # type: ignore[valid-type]
 SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
 PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
 """What a speed of 1 m/s is in each metric unit."""

@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -101,15 +102,27 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, RunSummary]]:
+def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The flight's run, done once; a test that writes into it works on a copy."""
     with made_once(tmp_path_factory, "run") as (folder, there):
-        root, told = folder / "whole", folder / "summary.json"
+        root = folder / "whole"
         if not there:
-            told.write_text(process(job(flight, root)).model_dump_json())
-        summary, left = RunSummary.model_validate_json(told.read_text()), digests(root)
-    yield root, summary
+            (folder / "summary.json").write_text(process(job(flight, root)).model_dump_json())
+        left = digests(root)
+    yield root
     assert digests(root) == left, "a test wrote into the run that all share"
+
+
+@pytest.fixture
+def copy(whole: Path, tmp_path: Path) -> Path:
+    """A copy of the whole run, for a test that writes into it."""
+    return Path(shutil.copytree(whole, tmp_path / "run"))
+
+
+@pytest.fixture
+def summary(whole: Path) -> RunSummary:
+    """What the flow of the whole run returned."""
+    return RunSummary.model_validate_json((whole.parent / "summary.json").read_text())
 
 
 @pytest.fixture(scope="session")

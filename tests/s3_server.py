@@ -21,7 +21,6 @@ def s3_server() -> Iterator[None]:
         pytest.MonkeyPatch.context() as patch,
         subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as started,
     ):
-        assert started.stderr is not None
         address = next(found[0] for line in started.stderr if (found := re.findall(r"http://127\.0\.0\.1:\d+", line)))
         threading.Thread(target=started.stderr.read, daemon=True).start()  # or its log would fill the pipe
         patch.setenv("AWS_ENDPOINT_URL", address)

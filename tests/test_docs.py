@@ -21,7 +21,6 @@ from flows.cli import app
 from flows.commands.serve import serve
 from schemas.detector import METHODS
 from schemas.flight import FlightConfig
-from schemas.summary import RunSummary
 from tests.media import drifting, write_video
 from velfield.field.pixel import PixelDistribution
 from velfield.field.view import VelocityField
@@ -64,9 +63,9 @@ def test_no_section_stands_twice_on_a_page(page: Path) -> None:
 
 
 @pytest.fixture
-def folder(whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with the files that the pages name."""
-    shutil.copytree(whole[0], tmp_path / "RUN")  # the commands write into it
+    shutil.copytree(whole, tmp_path / "RUN")  # the commands write into it
     write_video(tmp_path / "VIDEO.mp4", list(drifting(30)))
     rows = [f"{k},{k + t / 5},{10 * t / 5},{50}" for k in range(6) for t in range(60)]
     (tmp_path / "tracks.csv").write_text("\n".join(["track_id,time_s,x_m,y_m", *rows]))

@@ -1,6 +1,6 @@
 """Threads for the work of one unit on several images or models, where no graph runs it in parallel already.
 
-The steps of long work that nothing else counts: those of a training, whatever the method, for a progress bar.
+The steps of long work, for a progress bar: those of a stage, or of a training, whatever the method.
 """
 
 import os
@@ -59,26 +59,30 @@ def once(function: Callable[[], R]) -> Callable[[], R]:
     return call
 
 
-_step_listeners: list[Callable[[int, int], None]] = []
+StepListener = Callable[[int, int, str], None]
+_step_listeners: list[StepListener] = []
 
 
-def count_steps(done: int, announced: int = 0) -> None:
-    """Publish that so many more steps are done, and that so many more will follow."""
+def count_steps(done: int, announced: int = 0, stage: str = "") -> None:
+    """Publish that so many more steps of a stage are done, and that so many more will follow; no stage: a training."""
     for listener in tuple(_step_listeners):
-        listener(done, announced)
+        listener(done, announced, stage)
 
 
 @contextmanager
-def subscribe_steps(listener: Callable[[int, int], None]) -> Iterator[None]:
+def subscribe_steps(listener: StepListener) -> Iterator[None]:
     """Call ``listener`` with the steps of this process within the context, from any thread.
+
+    On a worker of a cluster nothing listens, and publishing costs nothing; there progress is shown unit by unit.
 
     Examples
     --------
     >>> received = []
-    >>> with subscribe_steps(lambda done, announced: received.append((done, announced))):
+    >>> with subscribe_steps(lambda *steps: received.append(steps)):
     ...     count_steps(0, announced=8)
+    ...     count_steps(1, stage="detections")
     >>> received
-    [(0, 8)]
+    [(0, 8, ''), (1, 0, 'detections')]
     """
     _step_listeners.append(listener)
     try:

@@ -151,10 +151,8 @@ def run(
     if plan:
         print(_describe_plan(job, where, of_tracks=tracks is not None))
         return DONE
-    if tracks is not None:
-        return _process_tracks(job, where, verbosity)
-    status = process(job, runner=where, verbosity=verbosity)
-    if status in (DONE, INCOMPLETE):
+    status = process(job, runner=where, verbosity=verbosity, of_tracks=tracks is not None)
+    if status in (DONE, INCOMPLETE) and tracks is None:
         root = shlex.quote(absolute(str(out)))
         print(f"answers {own_command()} analyse {root}   (turning counts, queues, signals, speeds)")
     return status
@@ -168,30 +166,36 @@ def _check_tracks(tracks: Path | None, frames_only: list[str]) -> None:
         raise InputError(f"--tracks cannot be combined with {', '.join(frames_only)}: tracks have no frames")
 
 
-def process(job: Job, *, runner: "RunnerConfig | None" = None, verbosity: "Verbosity" = "normal") -> int:
-    """Run a job on frames; the exit status."""
-    from velfield.pipeline.plan import check_inputs
-
-    console = _prepare(verbosity)
-    check_inputs(job)
-    _announce(job, console)
-    from flows.process_flight import run_flight
-    from flows.runners import RunnerConfig
-
-    summary = run_flight(job, runner or RunnerConfig(), console)
-    return conclude(summary, console)
-
-
-def _prepare(verbosity: "Verbosity") -> "Console":
-    """Set this process up for a run; its console."""
+def process(
+    job: Job,
+    *,
+    runner: "RunnerConfig | None" = None,
+    verbosity: "Verbosity" = "normal",
+    of_tracks: bool = False,
+) -> int:
+    """Run a job on frames, or on tracks, whose analysis is made too; the exit status."""
     from flows.launch import prepare_process
     from flows.stopping import stop_on_signals
+    from velfield.pipeline.plan import check_inputs
 
     stop_on_signals()
     prepare_process(verbose=verbosity == "verbose")
     from flows.console import Console
 
-    return Console(verbosity)
+    console = Console(verbosity)
+    if not of_tracks:
+        check_inputs(job)
+    _announce(job, console)
+    from flows.process_flight import run_flight
+    from flows.runners import RunnerConfig
+
+    summary = run_flight(job, runner or RunnerConfig(), console, of_tracks=of_tracks)
+    if of_tracks:
+        from velfield.pipeline.analysis.analyse import analyse_run
+
+        for line in analyse_run(Path(job.root)):
+            console.result(line)
+    return conclude(summary, console)
 
 
 def _announce(job: Job, console: "Console") -> None:
@@ -199,19 +203,6 @@ def _announce(job: Job, console: "Console") -> None:
     console.event(
         "open", f"velfield {version('velfield')}: {job.inputs.source} into {job.root}, preset {job.config.preset}"
     )
-
-
-def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity") -> int:
-    console = _prepare(verbosity)
-    _announce(job, console)
-    from flows.process_tracks import run_tracks
-
-    summary = run_tracks(job, runner, console)
-    from velfield.pipeline.analysis.analyse import analyse_run
-
-    for line in analyse_run(Path(job.root)):
-        console.result(line)
-    return conclude(summary, console)
 
 
 _LISTED = 10

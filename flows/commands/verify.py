@@ -1,6 +1,5 @@
 """``velfield verify``: the integrity of a run folder, and its repair."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -9,8 +8,6 @@ from flows.options import RunFolder
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
-    from schemas.job import Inputs
-    from schemas.records import FlightRecord
     from velfield.run.run import Run
 
 WHOLE, DAMAGED = 0, 3
@@ -53,21 +50,18 @@ def _repair(run: "Run") -> None:
     prepare_process(verbose=False)
     from flows.console import Console
     from flows.process_flight import run_flight
-    from flows.process_tracks import run_tracks
     from flows.runners import RunnerConfig
-    from schemas.job import Job
     from velfield.analysis.movements.time_slices import SLICE_S
     from velfield.pipeline.analysis.analyse import analyse_run
     from velfield.pipeline.given_tracks.plan import plan_tracks
-    from velfield.pipeline.plan import make_plan
+    from velfield.pipeline.plan import job_of, make_plan
     from velfield.pipeline.verify import invalidate, verify_run
     from velfield.run.commits import ANALYSIS, read_commit
     from velfield.run.flight_record import check_format
     from velfield.run.lock import locked
 
     check_format(run.layout.root)
-    given = _inputs(run.record, run.layout.root)
-    job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
+    job = job_of(run.layout, run.record)
     of_tracks = run.record.inputs.source.of_tracks
     plan = (plan_tracks if of_tracks else make_plan)(job)
     # Where the inputs changed since, it would be another run and not a repair.
@@ -79,14 +73,8 @@ def _repair(run: "Run") -> None:
     with locked(run.layout):
         damages = verify_run(run.layout, run.record)
         invalidate(run.layout, damages)
-    (run_tracks if of_tracks else run_flight)(job, RunnerConfig(), Console("normal"))
+    run_flight(job, RunnerConfig(), Console("normal"), of_tracks=of_tracks)
     if any(damage.stage == ANALYSIS for damage in damages):
         slice_s = SLICE_S if analysis is None else analysis.counts["slice_s"]
         for line in analyse_run(run.layout.root, slice_s=slice_s):
             print(line)
-
-
-def _inputs(record: "FlightRecord", root: Path) -> "Inputs":
-    if record.given is None:
-        raise InputError(f"{root} has no record of its inputs; run `velfield run ... --out {root}` again")
-    return record.given

@@ -8,7 +8,6 @@ import numpy as np
 from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.dataset import encode_targets
-from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.inference import Predictor
 from velfield.detection.cnn.model import (
     SCORE_OFFSET,
@@ -26,7 +25,6 @@ WINDOWS = (64, 48), (32, 32)
 
 def network() -> Predictor:
     shipped = shipped_detector()
-    assert isinstance(shipped, CnnDetector)
     return shipped.predictor
 
 

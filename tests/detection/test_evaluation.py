@@ -68,7 +68,6 @@ def test_precision_and_recall_are_those_of_a_naive_loop(seed: int) -> None:
 
 def test_the_operating_point_is_on_the_plateau_of_the_f_measure() -> None:
     curve = precision_recall_curve(held_out(3, detections=300, cars=200), "cars")
-    assert curve is not None
     assert curve.operating_point is not None
     precision, recall = np.array(curve.precision), np.array(curve.recall)
     f = 1.64 * precision * recall / (0.64 * precision + recall)
@@ -78,8 +77,6 @@ def test_the_operating_point_is_on_the_plateau_of_the_f_measure() -> None:
 def test_with_incomplete_labels_the_operating_point_follows_from_recall_alone() -> None:
     """Precision is unknown: what is not labelled may be a car."""
     complete, incomplete = (precision_recall_curve(held_out(3, 300, 200, kind), "cars") for kind in (True, False))
-    assert complete is not None
-    assert incomplete is not None
     recall = incomplete.recall[incomplete.operating_point or 0]
     assert 0.95 * incomplete.recall[-1] <= recall < 0.97 * incomplete.recall[-1]
     assert recall > complete.recall[complete.operating_point or 0]
@@ -163,7 +160,6 @@ def test_restricting_an_image_keeps_what_belongs_together() -> None:
     part = restrict_to_region(whole, region)
     inside = in_region(region, sample.cars)
     assert part.cars[:, 0].min() >= 39.5
-    assert part.abs_box_angle_rad is not None
     assert part.abs_box_angle_rad.tolist() == angles[inside].tolist()
     assert part.valid is not None
     assert (part.valid == (region & valid)).all()

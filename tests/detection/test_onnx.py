@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from schemas.detector import OnnxLayout
 from schemas.job import Job
-from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.detection.interface import Detector
 from velfield.detection.onnx.boxes import Boxes, suppress
@@ -139,7 +137,6 @@ def test_a_model_without_metadata_is_described_by_a_yaml(image: tuple[np.ndarray
 def test_the_yaml_of_the_documentation_describes_a_model(image: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
     page = (Path(__file__).resolve().parents[2] / "docs" / "detection.md").read_text()
     text = re.search(r"^# model\.yaml\n.*?(?=^```)", page, re.MULTILINE | re.DOTALL)
-    assert text is not None
     path = tiny_yolo(tmp_path / "model.onnx", "boxes", metadata=False)
     path.with_suffix(".yaml").write_text(text[0])
     detector = load_detector(path)
@@ -347,18 +344,14 @@ def plan_with(detector: Path, root: Path, threshold: float) -> Plan:
     return Plan(Job(root=str(root), inputs=inputs, config=config), made.info, made.indices, made.inputs, made.keys)
 
 
-def test_a_run_detects_with_it_on_raw_frames(
-    whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = tmp_path / "run"
-    shutil.copytree(whole[0], root)
+def test_a_run_detects_with_it_on_raw_frames(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tiny_yolo(tmp_path / "m.onnx", "oriented_boxes")
-    plan = plan_with(path, root, 0.75)
+    plan = plan_with(path, copy, 0.75)
     monkeypatch.setattr("velfield.detection.onnx.detector.device_limitations", lambda device: [f"no GPU: {device}"])
     outcome = make_detector(plan)
     assert outcome.counts["threshold"] == 0.25
     assert outcome.warnings.count("no GPU: auto") == 1
-    run, frame = open_run(root), 3
+    run, frame = open_run(copy), 3
     block = detect_block(plan, range(frame, frame + 1))
     detector: Detector = load_detector(path)
     raw = detector.detect_raw(run.frames.read(frame), threshold=0.75)
@@ -372,10 +365,10 @@ def test_a_run_detects_with_it_on_raw_frames(
 
 
 def test_a_model_that_finds_nothing_is_told_what_to_check(
-    whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tiny_yolo(tmp_path / "m.onnx", "oriented_boxes")
-    plan = plan_with(path, whole[0], 0.99999)
+    plan = plan_with(path, whole, 0.99999)
     monkeypatch.setattr("velfield.pipeline.stages.detector._scale_of_gsd", lambda _: None)
     with pytest.raises(InputError, match=r"^the detector found no vehicle in \d+ frames, expected some, as the scale "):
         make_detector(plan)

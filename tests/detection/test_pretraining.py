@@ -54,7 +54,6 @@ def test_unlabelled_tiles_are_labelled_only_where_both_networks_are_certain() ->
     part = type(tile)(np.ascontiguousarray(tile.image[y : y + 88, x : x + 88]), np.empty((0, 5)))
     module = start_from(shipped(), np.stack([np.zeros((96, 96), np.float32), np.ones((96, 96), np.float32)]))
     (labelled,) = label_tiles(module, shipped(), [part])
-    assert labelled.valid is not None
     assert 0.2 < labelled.valid.mean() <= 1
     rows, columns = (np.rint(labelled.cars[:, k]).astype(int) for k in (1, 0))
     assert labelled.valid[rows, columns].all()

@@ -102,7 +102,6 @@ def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tm
     assert eight.record.activation_ranges != detector.for_flight([cars(2)], CnnConfig()).record.activation_ranges
     eight.save(tmp_path / "detector.json")
     loaded = load_detector(tmp_path / "detector.json")
-    assert isinstance(loaded, CnnDetector)
     assert loaded.predictor.ranges == eight.record.activation_ranges
     assert eight.for_flight([cars(1)], CnnConfig(precision="float32")).predictor.ranges is None
 

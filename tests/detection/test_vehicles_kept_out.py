@@ -31,7 +31,6 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
     create_frame_store(plan)
     read_unit(plan, range(3))
     free = vehicle_free_mask(plan, 1, (120, 160))
-    assert free is not None
     assert not free[46:74, 52:108].any()
     assert free[:43].all()
     assert free[:, 114:].all()
@@ -59,7 +58,6 @@ def test_an_upright_box_masks_both_orientations_of_the_car_in_it(tmp_path: Path)
         config=resolve_config(overrides={"frames.fps": 5}),
     )
     free = vehicle_free_mask(make_plan(job), 0, (120, 160))
-    assert free is not None
     ends = [(80 + dx, 60 + dy) for dx in (-18, 18) for dy in (-18, 18)]
     assert not any(free[y, x] for x, y in ends)
     assert free[60, 55]

@@ -86,7 +86,6 @@ def test_geotrax_is_read_back_as_it_was(georeference: Georeference, tmp_path: Pa
     (tmp_path / "t.csv").write_text(geotrax_csv(tracklets_of(PATHS), georeference))
     read = read_tracks(tmp_path / "t.csv")
     assert read.unit == "m"
-    assert read.speed is not None
     assert read.speed.factor is not None
     for (_, car), (_, _, vx, vy, _) in zip(read.table.groupby("track_id"), PATHS.values(), strict=True):
         step = car[["x", "y"]].to_numpy()[-1] - car[["x", "y"]].to_numpy()[0]
@@ -173,6 +172,5 @@ def test_opendrive_says_where_its_y_points(run: Run, tmp_path: Path) -> None:
     said = {one.get("code"): one.get("value") for one in root.iter("userData")}
     assert float(said["bearing_of_y_deg"] or "nan") == pytest.approx(TURN_DEG, abs=1.5)  # and the zone's convergence
     first = root.find("road/planView/geometry")
-    assert first is not None
     heading = np.degrees(float(first.get("hdg", "nan")))
     assert heading == pytest.approx(np.degrees(np.arctan2(4, 8)), abs=3)  # y up

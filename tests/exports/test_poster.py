@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from schemas.export import ExportOptions
-from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.exports.export import export_run
@@ -16,11 +15,9 @@ from velfield.exports.export import export_run
 OPTIONS = ExportOptions(width_px=400, start=datetime(2024, 5, 1, 12, tzinfo=UTC))
 
 
-def test_a_pdf_is_one_page_with_both_maps_and_the_same_bytes_each_time(
-    whole: tuple[Path, RunSummary], tmp_path: Path
-) -> None:
+def test_a_pdf_is_one_page_with_both_maps_and_the_same_bytes_each_time(whole: Path, tmp_path: Path) -> None:
     first, second = (
-        export_run(open_run(whole[0]), "poster", tmp_path / f"{k}.pdf", OPTIONS).read_bytes() for k in range(2)
+        export_run(open_run(whole), "poster", tmp_path / f"{k}.pdf", OPTIONS).read_bytes() for k in range(2)
     )
     assert first == second
     assert first.startswith(b"%PDF-")
@@ -28,11 +25,11 @@ def test_a_pdf_is_one_page_with_both_maps_and_the_same_bytes_each_time(
     assert len(re.findall(rb"/Width 400\b", first)) == 2
 
 
-def test_an_svg_holds_its_texts_and_asks_for_nothing(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
-    text = export_run(open_run(whole[0]), "poster", tmp_path / "sheet.svg", OPTIONS).read_text()
+def test_an_svg_holds_its_texts_and_asks_for_nothing(whole: Path, tmp_path: Path) -> None:
+    text = export_run(open_run(whole), "poster", tmp_path / "sheet.svg", OPTIONS).read_text()
     root = ET.fromstring(text)
     texts = ["".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")]
-    vehicles = open_run(whole[0]).vehicles()
+    vehicles = open_run(whole).vehicles()
     facts = next(line for line in texts if "vehicles move or wait in a lane" in line)
     assert f"n = {(vehicles['state'] != 'parked').sum()} vehicles move or wait in a lane" in facts
     assert "2024-05-01 12:00 UTC" in facts
@@ -41,6 +38,6 @@ def test_an_svg_holds_its_texts_and_asks_for_nothing(whole: tuple[Path, RunSumma
     assert not re.findall(r'href="(?!data:|#)', text)
 
 
-def test_another_type_is_refused(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+def test_another_type_is_refused(whole: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"found a poster as \.png, expected \.pdf or \.svg"):
-        export_run(open_run(whole[0]), "poster", tmp_path / "sheet.png", OPTIONS)
+        export_run(open_run(whole), "poster", tmp_path / "sheet.png", OPTIONS)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from schemas.export import ExportOptions
-from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.exports.export import export_run
@@ -19,10 +18,10 @@ WIDTH = 640
 
 
 @pytest.fixture(scope="module")
-def clip(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def clip(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     steps: list[tuple[int, int]] = []
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
-    run = open_run(whole[0])
+    run = open_run(whole)
     export_run(run, "video", path, ExportOptions(width_px=WIDTH), lambda done, total: steps.append((done, total)))
     registered = run.registration_status.count("ok")
     assert steps == [(k, registered) for k in range(1, registered + 1)]
@@ -30,8 +29,8 @@ def clip(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFactor
     return path
 
 
-def test_the_clip_is_h264_and_keeps_the_true_times(clip: Path, whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_the_clip_is_h264_and_keeps_the_true_times(clip: Path, whole: Path) -> None:
+    run = open_run(whole)
     times = run.times_s[[status == "ok" for status in run.registration_status]]
     with av.open(str(clip)) as container:
         stream = container.streams.video[0]
@@ -44,8 +43,8 @@ def test_the_clip_is_h264_and_keeps_the_true_times(clip: Path, whole: tuple[Path
     np.testing.assert_allclose(shown, times - times[0], atol=1e-3)
 
 
-def test_a_vehicle_is_drawn_where_its_track_is(clip: Path, whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_a_vehicle_is_drawn_where_its_track_is(clip: Path, whole: Path) -> None:
+    run = open_run(whole)
     frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]
     chosen = frames[len(frames) // 2]
     with av.open(str(clip)) as container:
@@ -60,8 +59,8 @@ def test_a_vehicle_is_drawn_where_its_track_is(clip: Path, whole: tuple[Path, Ru
     assert np.mean([saturation[place] > 100 for place in at]) > 0.8
 
 
-def test_speeds_do_not_cover_one_another(whole: tuple[Path, RunSummary], monkeypatch: pytest.MonkeyPatch) -> None:
-    run = open_run(whole[0])
+def test_speeds_do_not_cover_one_another(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = open_run(whole)
     scene = video._Scene.of(run, ExportOptions(width_px=900))
     written: list[tuple[str, tuple[int, int], float]] = []
     monkeypatch.setattr(video._Scene, "_write", staticmethod(lambda image, *what: written.append(what)))
@@ -77,14 +76,14 @@ def test_speeds_do_not_cover_one_another(whole: tuple[Path, RunSummary], monkeyp
         assert x1 <= u0 or u1 <= x0 or y1 <= v0 or v1 <= y0
 
 
-def test_a_video_that_no_player_reads_is_refused(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+def test_a_video_that_no_player_reads_is_refused(whole: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--width 9000: found a video of 9000 x \d+ px"):
-        export_run(open_run(whole[0]), "video", tmp_path / "clip.mp4", ExportOptions(width_px=9000))
+        export_run(open_run(whole), "video", tmp_path / "clip.mp4", ExportOptions(width_px=9000))
     assert not list(tmp_path.iterdir())
 
 
-def test_vehicles_are_drawn_as_long_as_they_were_measured(whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_vehicles_are_drawn_as_long_as_they_were_measured(whole: Path) -> None:
+    run = open_run(whole)
     lengths_m = run.vehicles().set_index("track_id")["length_m"].dropna()
     tracks = video._Tracks.of(run, 5.0)
     drawn_m = np.unique(np.round(tracks.cars_long * video._LENGTH_M, 3))

@@ -199,7 +199,6 @@ def test_a_turn_towards_the_horizon_in_mid_flight_is_reported(tmp_path: Path) ->
     assert RegistrationStore(plan.layout.registration).statuses() == ["ok"] * 7
     (line,) = [line for line in register_unit(plan, range(7)).warnings if "degrees" in line]
     found = re.search(r"at up to (\d+) degrees from the base image's view", line)
-    assert found is not None
     assert 22 <= int(found[1]) <= 33
 
 
@@ -217,15 +216,9 @@ def oblique(tilt_deg: float, seed: int = 21) -> GreyImage:
     return small_flight(frames=1, width=800, height=600, seed=seed, camera=camera).frame(0)
 
 
-@pytest.fixture(scope="module")
-def from_above() -> GreyImage:
-    return oblique(0.0)
-
-
 def test_an_oblique_view_is_reported(tmp_path: Path) -> None:
     frame = oblique(40.0)
     found = tilt_of_frames([frame], pinhole(frame.shape))
-    assert found is not None
     assert found.is_oblique
     assert found.degrees == pytest.approx(40, abs=6)
     plan = planned(tmp_path, [frame, np.roll(frame, 2, axis=1), np.roll(frame, 4, axis=1)], "lens", "lens.refine=never")
@@ -234,24 +227,19 @@ def test_an_oblique_view_is_reported(tmp_path: Path) -> None:
     assert "--base" in line
 
 
-def test_a_view_from_above_is_not(from_above: GreyImage) -> None:
-    found = tilt_of_frames([from_above], pinhole(from_above.shape))
-    assert found is not None
+def test_a_view_from_above_is_not() -> None:
+    frame = oblique(0.0)
+    found = tilt_of_frames([frame], pinhole(frame.shape))
     assert not found.is_oblique
     assert found.degrees < 10
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real footage is not here")
-@pytest.mark.parametrize("name", ["songdo/00003.jpg", "songdo/00972.jpg", "songdo/03936.jpg"])
-def test_real_views_from_above_are_not(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "is_oblique"),
+    [(f"songdo/{frame}.jpg", False) for frame in ("00003", "00972", "03936")] + [("minsk/DJI_0762-00003.jpg", True)],
+)
+def test_real_views_from_above_are_not_and_an_oblique_one_is(name: str, is_oblique: bool) -> None:
     frame = read_grey_image(REAL / name, 10**9)
     found = tilt_of_frames([frame], pinhole(frame.shape))
-    assert found is None or not found.is_oblique
-
-
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real footage is not here")
-def test_a_real_oblique_view_is() -> None:
-    frame = read_grey_image(REAL / "minsk" / "DJI_0762-00003.jpg", 10**9)
-    found = tilt_of_frames([frame], pinhole(frame.shape))
-    assert found is not None
-    assert found.is_oblique
+    assert (found is not None and found.is_oblique) == is_oblique

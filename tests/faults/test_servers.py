@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -16,7 +15,6 @@ import numpy as np
 import psutil
 import pytest
 
-from schemas.summary import RunSummary
 from tests.small_flight import job, process
 from tests.viewer.test_viewer_server import served
 from velfield.errors import InputError
@@ -84,11 +82,8 @@ def test_a_run_listens_on_this_machine_alone(flight: Path, tmp_path: Path) -> No
 
 @pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")
 @pytest.mark.parametrize("command", ["view", "annotate", "georeference"])
-def test_each_page_as_a_process_listens_on_this_machine_alone(
-    command: str, whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(whole[0], tmp_path / "run")
-    with velfield_process(command, str(tmp_path / "run"), "--no-open") as process:
+def test_each_page_as_a_process_listens_on_this_machine_alone(command: str, copy: Path) -> None:
+    with velfield_process(command, str(copy), "--no-open") as process:
         assert sockets_seen(process, until=lambda: True) == {"127.0.0.1"}
 
 

@@ -108,8 +108,6 @@ CITY_GSD_M = 0.23
 
 def test_the_example_finds_fewer_wrong_links_at_no_lower_recall() -> None:
     spec = importlib.util.spec_from_file_location("prior_for_a_tracker", ROOT / "examples" / "prior_for_a_tracker.py")
-    assert spec is not None
-    assert spec.loader is not None
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
     plain, helped = example.measure(5, frames=300, size=(240, 180))

@@ -26,7 +26,6 @@ from flows.runners import (
     open_runner,
     read_runner,
 )
-from schemas.summary import RunSummary
 from tests.faults.test_refusals import command
 from tests.foreign_cluster import foreign_cluster
 from tests.small_flight import digests, job, process
@@ -42,7 +41,6 @@ EXAMPLES = sorted((ROOT / "examples").glob("cluster-*.yaml"))
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_the_examples_are_read_and_list_what_runs_where(path: Path) -> None:
     runner = read_runner(path)
-    assert runner.cluster_class is not None
     assert runner.cluster_class.split(".")[0] in path.read_text().split("pip install ")[1].replace("-", "_")
     assert runner.workers is not None
     assert runner.workers > 1
@@ -129,8 +127,10 @@ def test_workers_that_the_cluster_gave_up_are_replaced(
         else:
             with pytest.raises(WorkersKilledError):
                 runner.call(os.kill, before, 9)
+            # Its nanny may start it again just before it is given up, with the next call under way.
+            runner._cluster.scheduler.allowed_failures = 3
         assert runner.call(os.getpid) not in (before, os.getpid())
-    assert len(said) == (cluster_class is not None)  # one that is restarted has not ended on its own
+    assert bool(said) == (cluster_class is not None)  # one that is restarted has not ended on its own
 
 
 def before_detection(whole: Path, root: Path) -> Path:
@@ -153,13 +153,9 @@ def one_that_kills_its_worker(plan: object, frames: range) -> object:
 
 
 def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
-    whole: tuple[Path, RunSummary],
-    flight: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    whole: Path, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = before_detection(whole[0], tmp_path / "run")
+    root = before_detection(whole, tmp_path / "run")
     asked = {"cluster_class": "distributed.LocalCluster", "workers": 2}
     asked["cluster_kwargs"] = {"n_workers": 0, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
     (tmp_path / "cluster.yaml").write_text(yaml.safe_dump(ClusterFile.model_validate(asked).model_dump()))
@@ -171,7 +167,7 @@ def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
     assert summary.complete
     said = "".join(capsys.readouterr())
     assert said.count("ended, or was lost: its work is computed again on another") == 1, said
-    assert digests(root) == digests(whole[0])
+    assert digests(root) == digests(whole)
 
 
 def one_that_needs_too_much_memory(plan: object, frames: range) -> object:
@@ -189,36 +185,37 @@ def one_that_needs_too_much_memory(plan: object, frames: range) -> object:
 
 
 def test_a_unit_over_the_memory_limit_is_tried_once_more_and_then_left_out_with_the_reason(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, copy: Path, flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = Path(shutil.copytree(whole[0], tmp_path / "run"))
-    (root / "commits/detections/000008-000015.json").unlink()
+    (copy / "commits/detections/000008-000015.json").unlink()
     here = {"n_workers": 0, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "memory_limit": "1200MB"}
     runner = RunnerConfig(cluster_class="distributed.LocalCluster", workers=1, cluster_kwargs=here)
     monkeypatch.setattr("velfield.pipeline.stages.detections.detect_block", one_that_needs_too_much_memory)
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):  # else Dask itself tries it on others first
-        summary = process(job(flight, root), runner)
-    assert len(set((root / "attempts").read_text().split())) == 2
+        summary = process(job(flight, copy), runner)
+    assert len(set((copy / "attempts").read_text().split())) == 2
     assert not summary.complete
     (why,) = next(stage.failures for stage in summary.stages if stage.name == "detections")
     assert "detections of frames 8 to 15 (" in why
     assert "failed: 1 worker of tcp://" in why
     assert "the memory limit is too small" in why
+    said = "".join(capsys.readouterr())  # Dask gave it up each time: that another computes it is no promise
+    assert said.count("is computed again on another") == said.count("another, unless it has ended too many workers") > 0
     monkeypatch.undo()
-    (root / "attempts").unlink()
-    assert process(job(flight, root)).complete
-    assert digests(root) == digests(whole[0])
+    (copy / "attempts").unlink()
+    assert process(job(flight, copy)).complete
+    assert digests(copy) == digests(whole)
 
 
 def test_workers_elsewhere_without_flows_give_the_same(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All but lens, base image and detector is done there; the run folder is given by a path from where we stand."""
     monkeypatch.chdir(tmp_path)
-    link_shared_outputs(RunLayout(whole[0]), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
+    link_shared_outputs(RunLayout(whole), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
     with foreign_cluster(tmp_path) as address:
         process(job(flight, Path("run")), RunnerConfig(scheduler=address))
-    assert digests(tmp_path / "run") == digests(whole[0])
+    assert digests(tmp_path / "run") == digests(whole)
 
 
 def test_a_cluster_without_workers_is_said_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,8 +27,7 @@ from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
 
 
-def test_the_run_folder_is_as_the_contract_lists(whole: tuple[Path, RunSummary]) -> None:
-    root, summary = whole
+def test_the_run_folder_is_as_the_contract_lists(whole: Path, summary: RunSummary) -> None:
     assert [stage.name for stage in summary.stages] == list(STAGE)
     assert [stage.text for stage in summary.stages if "nan" in stage.text] == []
     assert summary.complete
@@ -43,11 +42,11 @@ def test_the_run_folder_is_as_the_contract_lists(whole: tuple[Path, RunSummary])
         "maps/speed.png",
     )
     names += ("maps/direction.tif", "maps/speed.tif", "index.html", "commits")
-    assert [name for name in names if not (root / name).exists()] == []
+    assert [name for name in names if not (whole / name).exists()] == []
 
 
-def test_the_python_side_of_the_contract(whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_the_python_side_of_the_contract(whole: Path) -> None:
+    run = open_run(whole)
     assert run.times_s.shape == (FRAMES,)
     assert list(run.registration_status) == ["ok"] * FRAMES
     assert list(run.detections().columns) == list(DETECTION_COLUMNS)
@@ -73,19 +72,17 @@ def test_the_python_side_of_the_contract(whole: tuple[Path, RunSummary]) -> None
     assert fast > slow
 
 
-def test_accuracy_on_the_small_flight(whole: tuple[Path, RunSummary], flight: Path) -> None:
+def test_accuracy_on_the_small_flight(whole: Path, flight: Path) -> None:
     from velfield.synthetic.run_score import score_run
 
-    score = score_run(whole[0], flight, min_count=1)
+    score = score_run(whole, flight, min_count=1)
     assert score.registration.mean_px < 1.0
     assert score.registration.jitter_px < 0.25
     assert score.tracking.precision_moving > 0.95
     assert score.field.pixels > 1000
 
 
-def test_a_run_on_another_base_image_has_no_score(
-    whole: tuple[Path, RunSummary], flight: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_on_another_base_image_has_no_score(whole: Path, flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from velfield.synthetic.run_score import score_run
     from velfield.synthetic.truth import Truth
 
@@ -97,32 +94,27 @@ def test_a_run_on_another_base_image_has_no_score(
         InputError,
         match=r"positions differ from those of .* px \(mean\): its base image is another one; score a run with --base",
     ):
-        score_run(whole[0], flight)
+        score_run(whole, flight)
 
 
-def test_a_second_run_recomputes_nothing(whole: tuple[Path, RunSummary], flight: Path) -> None:
-    root, _ = whole
-    before = digests(root)
-    again = process(job(flight, root))
+def test_a_second_run_recomputes_nothing(whole: Path, flight: Path) -> None:
+    before = digests(whole)
+    again = process(job(flight, whole))
     assert redone(again) == []
-    assert digests(root) == before
+    assert digests(whole) == before
     assert all(stage.seconds_before > 0 for stage in again.stages)  # the report lists what the work took, once done
 
 
-def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
-    root = tmp_path / "copy"
-    shutil.copytree(whole[0], root)
-    changed = process(job(flight, root, "tracking.max_speed_m_per_s=5"))
+def test_a_changed_gate_redoes_tracking_onward(copy: Path, flight: Path) -> None:
+    changed = process(job(flight, copy, "tracking.max_speed_m_per_s=5"))
     assert redone(changed) == ["tracklets", "tracks", "scale", "field", "maps"]
-    velocities = open_run(root).tracklets()[["vx_01_px_per_s", "vy_01_px_per_s"]]
+    velocities = open_run(copy).tracklets()[["vx_01_px_per_s", "vy_01_px_per_s"]]
     speeds = np.hypot(*velocities.to_numpy().T) * 0.23
     assert np.quantile(speeds, 0.99) < 10.5  # 5 m/s and what jitter adds
     assert speeds.max() < 14  # a position may be refined by a pixel or two after the gates
 
 
-def test_workers_give_the_same_bits(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_give_the_same_bits(whole: Path, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers of a long flight, which are restarted on the way; previews have a test of their own.
 
     The first time they are: each start takes 5 s of processor, and tests of clusters show what a restart does.
@@ -135,15 +127,11 @@ def test_workers_give_the_same_bits(
     )
     process(job(flight, tmp_path / "workers"), RunnerConfig(workers=2))
     assert len(restarted) == sum(stage.new_workers for stage in STAGES) > 0
-    assert digests(tmp_path / "workers") == digests(whole[0])
+    assert digests(tmp_path / "workers") == digests(whole)
 
 
 def test_a_unit_that_fails_once_is_retried(
-    whole: tuple[Path, RunSummary],
-    flight: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    copy: Path, flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from velfield.pipeline.stages import frames as step
 
@@ -157,10 +145,8 @@ def test_a_unit_that_fails_once_is_retried(
         return true(plan, frames)
 
     monkeypatch.setattr(step, "read_unit", failing)
-    root = tmp_path / "run"
-    shutil.copytree(whole[0], root)
-    shutil.rmtree(root / "commits/frames")
-    summary = process(job(flight, root))
+    shutil.rmtree(copy / "commits/frames")
+    summary = process(job(flight, copy))
     assert redone(summary) == ["frames"]
     assert not summary.stages[0].lost
     assert len(calls) == summary.stages[0].units + 1
@@ -173,7 +159,7 @@ def starts(root: Path) -> set[int]:
 
 
 def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from velfield.pipeline.stages import detections as step
 
@@ -185,13 +171,13 @@ def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
         return true(plan, frames)
 
     root = tmp_path / "run"
-    link_shared_outputs(RunLayout(whole[0]), RunLayout(root), ("lens", "base", "detector"))
+    link_shared_outputs(RunLayout(whole), RunLayout(root), ("lens", "base", "detector"))
     monkeypatch.setattr(step, "detect_block", failing)
     summary = process(job(flight, root))
     lost = {stage.name: stage.lost for stage in summary.stages if stage.lost}
     assert lost == {"detections": ("000008-000015",), "tracklets": ("000008-000015",)}
     # The units beside it lose no more than the windows that reach into it.
-    assert starts(root) == {frame for frame in starts(whole[0]) if frame < 6 or frame >= 16}
+    assert starts(root) == {frame for frame in starts(whole) if frame < 6 or frame >= 16}
     assert not summary.complete
     (why,) = next(stage.failures for stage in summary.stages if stage.name == "detections")
     assert why.startswith(f"{root}: detections of frames 8 to 15 (")
@@ -200,16 +186,12 @@ def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
     monkeypatch.setattr(step, "detect_block", true)
     again = process(job(flight, root))
     assert again.complete
-    assert digests(root) == digests(whole[0])
+    assert digests(root) == digests(whole)
 
 
 @pytest.mark.parametrize("fault", ["a frame more", "a time twice", "a frame without time"])
 def test_footage_that_is_not_all_there_ends_with_status_3(
-    fault: str,
-    whole: tuple[Path, RunSummary],
-    flight: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    fault: str, whole: Path, summary: RunSummary, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = (flight / "timestamps.csv").read_text().splitlines()
     if fault == "a frame more":
@@ -219,14 +201,14 @@ def test_footage_that_is_not_all_there_ends_with_status_3(
     else:
         del lines[5]
     (tmp_path / "timestamps.csv").write_text("\n".join(lines))
-    plan = make_plan(job(flight, whole[0], timestamps=str(tmp_path / "timestamps.csv")))
-    summary = summarise_run(plan, whole[1].stages)
-    assert whole[1].complete
-    assert not summary.complete
-    assert len(summary.footage_lost) == 1
-    assert conclude(summary, Console()) == 3
-    assert summary.footage_lost[0] in capsys.readouterr().err
-    assert "Not complete" in render_report(make_report(plan, summary), [])
+    plan = make_plan(job(flight, whole, timestamps=str(tmp_path / "timestamps.csv")))
+    found = summarise_run(plan, summary.stages)
+    assert summary.complete
+    assert not found.complete
+    assert len(found.footage_lost) == 1
+    assert conclude(found, Console()) == 3
+    assert found.footage_lost[0] in capsys.readouterr().err
+    assert "Not complete" in render_report(make_report(plan, found), [])
 
 
 def test_refused_labels_leave_no_folder(flight: Path, server: None, tmp_path: Path) -> None:
@@ -236,21 +218,17 @@ def test_refused_labels_leave_no_folder(flight: Path, server: None, tmp_path: Pa
     assert not (tmp_path / "run").exists()
 
 
-def test_a_scale_at_which_no_car_can_be_seen_is_refused(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def test_a_scale_at_which_no_car_can_be_seen_is_refused(copy: Path, flight: Path) -> None:
     """A slip of the decimal point: the search for cars of 2 px takes hours."""
-    shutil.copytree(whole[0], tmp_path / "run")
-    work = job(flight, tmp_path / "run")
+    work = job(flight, copy)
     with pytest.raises(InputError, match=r"found a scale of 2\.3 m a pixel of the map, at which a car is 1\.9 px long"):
         process(work.model_copy(update={"config": work.config.model_copy(update={"gsd_m": 2.3})}))
 
 
-def test_commit_records_hold_counts_and_digests(whole: tuple[Path, RunSummary]) -> None:
-    root, _ = whole
-    record = json.loads((root / "commits" / "detections" / "000008-000015.json").read_text())
+def test_commit_records_hold_counts_and_digests(whole: Path) -> None:
+    record = json.loads((whole / "commits" / "detections" / "000008-000015.json").read_text())
     assert record["counts"]["frames"] == 8
-    sure = pd.concat(pd.read_parquet(path) for path in root.glob("detections/unit-*.parquet"))
+    sure = pd.concat(pd.read_parquet(path) for path in whole.glob("detections/unit-*.parquet"))
     assert record["counts"]["cars"] == int(sure["frame"].between(8, 15).sum())
     assert all(digest for name, digest in record["outputs"].items() if name.endswith(".parquet"))
 
@@ -267,9 +245,7 @@ def true_boxes(flight: Path) -> pd.DataFrame:
     )
 
 
-def test_detections_of_another_detector_take_the_place_of_ours(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def test_detections_of_another_detector_take_the_place_of_ours(whole: Path, flight: Path, tmp_path: Path) -> None:
     table = true_boxes(flight)
     table.to_csv(tmp_path / "boxes.csv", index=False)
     summary = process(job(flight, tmp_path / "run", detections=str(tmp_path / "boxes.csv")))
@@ -308,7 +284,6 @@ def test_the_size_of_given_boxes_sets_the_working_scale(flight: Path, tmp_path: 
         record = json.loads((tmp_path / boxes.stem / "base" / "working.json").read_text())
         scales.append(record["scale"])
         commit = read_commit(plan.layout, "detector", "all")
-        assert commit is not None
         warned.append([line for line in commit.warnings if "size" in line])
     assert scales[0] == pytest.approx(0.8, rel=0.1)
     assert scales[1] == 1.0

@@ -12,7 +12,6 @@ import pytest
 from flows.console import Console
 from flows.process_flight import run_flight
 from flows.runners import RunnerConfig, open_runner
-from schemas.summary import RunSummary
 from tests.small_flight import FRAMES, digests, job
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.preview import make_first_preview, publish_first_preview
@@ -58,15 +57,15 @@ def _always(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("_always")
 def test_previews_come_and_grow_and_leave_no_trace(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from velfield.pipeline.stages import detections as step
 
     root = tmp_path / "run"
-    link_shared_outputs(RunLayout(whole[0]), RunLayout(root), ("frames", "lens", "base", "registration", "detector"))
+    link_shared_outputs(RunLayout(whole), RunLayout(root), ("frames", "lens", "base", "registration", "detector"))
     for name in ("frames.zarr", "registration.zarr"):
         shutil.rmtree(root / name)
-        shutil.copytree(whole[0] / name, root / name)
+        shutil.copytree(whole / name, root / name)
     console = Recording(root)
     true = step.detect_block
 
@@ -88,7 +87,7 @@ def test_previews_come_and_grow_and_leave_no_trace(
         assert vehicles > 0
     assert console.seen[-1][2] < FieldStore(root / "field.zarr").layer("count").sum()
     assert not RunLayout(root).preview.exists()
-    assert digests(root) == digests(whole[0])
+    assert digests(root) == digests(whole)
 
 
 def test_a_worker_makes_the_first_preview_by_itself(flight: Path, tmp_path: Path) -> None:
@@ -106,17 +105,15 @@ def test_a_worker_makes_the_first_preview_by_itself(flight: Path, tmp_path: Path
 
 @pytest.mark.usefixtures("_always")
 def test_a_preview_that_fails_fails_alone(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, copy: Path, flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_arguments: Any) -> int:
         raise OSError("no space left")
 
     monkeypatch.setattr("velfield.pipeline.preview.make_first_preview", broken)
-    root = tmp_path / "run"
-    shutil.copytree(whole[0], root)
-    (root / "index.html").unlink()
-    console = Recording(root)
-    assert run_flight(job(flight, root), RunnerConfig(), console).complete
+    (copy / "index.html").unlink()
+    console = Recording(copy)
+    assert run_flight(job(flight, copy), RunnerConfig(), console).complete
     assert console.warnings == ["no preview of the field: no space left"]
     assert console.seen == []
-    assert digests(root) == digests(whole[0])
+    assert digests(copy) == digests(whole)

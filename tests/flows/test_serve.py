@@ -150,26 +150,11 @@ def test_all_addresses_with_a_password(tmp_path: Path) -> None:
     port = free_port()
     ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     environment = {**ours, "HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    command = [
-        sys.executable,
-        "-m",
-        "flows.cli",
-        "serve",
-        str(tmp_path / "served"),
-        "--host",
-        "0.0.0.0",
-        "--port",
-        str(port),
-    ]
-    errors = (tmp_path / "errors").open("w+")
-    with (
-        errors,
-        subprocess.Popen(
-            [*command, "--auth", AUTH], env=environment, stdout=subprocess.PIPE, stderr=errors, text=True
-        ) as process,
-    ):
+    at = ["--host", "0.0.0.0", "--port", str(port), "--auth", AUTH]
+    command = [sys.executable, "-m", "flows.cli", "serve", str(tmp_path / "served"), *at]
+    told_to: dict[str, Any] = {"env": environment, "stdout": subprocess.PIPE, "text": True}
+    with (tmp_path / "errors").open("w+") as errors, subprocess.Popen(command, stderr=errors, **told_to) as process:
         try:
-            assert process.stdout is not None
             told = process.stdout.readline().strip()
             assert told == f"Prefect UI  http://127.0.0.1:{port}, port {port} of all its addresses"
             assert (tmp_path / "served" / "prefect.db").exists()
@@ -363,11 +348,11 @@ class Served:
 
 
 @pytest.fixture(scope="module")
-def served(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A served folder with one run in it, from a working folder with a decoy."""
     tmp_path = tmp_path_factory.mktemp("serve")
     folder, port = tmp_path / "served", free_port()
-    shutil.copytree(whole[0], folder / "runs" / "main-street")
+    shutil.copytree(whole, folder / "runs" / "main-street")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere/flows.py").write_text("raise RuntimeError('a decoy was imported')")
     ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
@@ -378,7 +363,6 @@ def served(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFact
         command, env=environment, cwd=tmp_path / "elsewhere", stdout=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
-        assert process.stdout is not None
         assert process.stdout.readline().strip() == f"Prefect UI  http://127.0.0.1:{port}"
         yield Served(process, folder, f"http://127.0.0.1:{port}")
     finally:
@@ -483,12 +467,10 @@ _BLINKS = """if True:
 """
 
 
-def test_the_ui_shows_graph_retry_and_artifacts(
-    served: Served, whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def test_the_ui_shows_graph_retry_and_artifacts(served: Served, whole: Path, flight: Path, tmp_path: Path) -> None:
     """In a real browser: the graph drawn, a task that was tried twice shown so, the summary with its maps."""
     root = tmp_path / "blinks"
-    shutil.copytree(whole[0], root)
+    shutil.copytree(whole, root)
     (root / "commits/tracklets/000008-000015.json").unlink()
     environment = {**os.environ, "PREFECT_API_URL": f"{served.url}/api", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", _BLINKS, str(flight), str(root)], env=environment, check=True)

@@ -29,7 +29,6 @@ def test_what_a_process_started_ends_with_it(kill: bool) -> None:
         env={**os.environ, "PYTHONPATH": checkout},
         text=True,
     ) as process:
-        assert process.stdout is not None
         child = psutil.Process(int(process.stdout.readline()))
         with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as bystander:
             try:

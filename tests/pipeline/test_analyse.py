@@ -129,7 +129,6 @@ def test_lengths_and_widths_of_a_file_give_classes(folder: Path, capsys: pytest.
     table.assign(length_m=np.where(is_bus, 12.0, 4.4), width_m=np.where(is_bus, 2.5, 1.8)).to_csv(path, index=False)
     analyse(tracks=path, out=folder.parent / "sizes")
     found = re.search(r"car or van ([\d.]+) % .* lorry or bus ([\d.]+) %", capsys.readouterr().out)
-    assert found is not None
     assert [float(share) for share in found.groups()] == pytest.approx([75, 25], abs=1)
 
 

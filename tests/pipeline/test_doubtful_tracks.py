@@ -1,11 +1,9 @@
 """A doubtful thing is in one table of a run; detections are read with it and without."""
 
-import shutil
 from pathlib import Path
 
 import pandas as pd
 
-from schemas.summary import RunSummary
 from schemas.tables import TRACK_POSITION_COLUMNS
 from tests.small_flight import job
 from velfield import open_run
@@ -26,9 +24,9 @@ def apart(run: Run, tracks: set[int]) -> pd.DataFrame:
 
 
 def test_a_doubtful_thing_is_set_apart_and_kept_where_none_is_to_be_doubted(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+    whole: Path, copy: Path, flight: Path
 ) -> None:
-    run = open_run(whole[0])
+    run = open_run(whole)
     vehicles = run.vehicles(doubtful=True)
     doubtful = ids(vehicles[vehicles["doubtful"]])
     assert doubtful
@@ -38,9 +36,8 @@ def test_a_doubtful_thing_is_set_apart_and_kept_where_none_is_to_be_doubted(
     assert doubtful <= its  # a track is named after its first detection
     assert not its & ids(run.track_positions(), "detection_id")
     assert its - ids(apart(run, doubtful), "detection_id")  # in no track
-    shutil.copytree(whole[0], tmp_path / "run")
-    compute_stages(make_plan(job(flight, tmp_path / "run", "tracking.doubt=false")), ["tracks"])
-    again = open_run(tmp_path / "run")
+    compute_stages(make_plan(job(flight, copy, "tracking.doubt=false")), ["tracks"])
+    again = open_run(copy)
     assert not again.vehicles(doubtful=True)["doubtful"].any()
     assert doubtful <= ids(again.tracklets())
     assert ids(again.detections(), "detection_id") == ids(every, "detection_id")

@@ -10,7 +10,7 @@ import pytest
 
 from flows.console import Console
 from flows.orchestration import Threads
-from flows.process_tracks import process_tracks
+from flows.process_flight import process_tracks
 from flows.runners import RunnerConfig
 from schemas.job import Inputs, Job
 from schemas.records import InputsRecord, SourceRecord

@@ -12,9 +12,7 @@ import rasterio
 from flows.cli import app
 from schemas.georeference import ControlPoint
 from schemas.job import Inputs
-from schemas.scale import ScaleEstimate
 from schemas.simulation import SimulationConfig
-from schemas.summary import RunSummary
 from schemas.tables import TRACK_COLUMNS
 from velfield import open_run
 from velfield.errors import InputError
@@ -42,9 +40,9 @@ LON, LAT = 13.4, 52.5
 
 
 @pytest.fixture(scope="module")
-def copied(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def copied(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("georeference") / "run"
-    shutil.copytree(whole[0], root)
+    shutil.copytree(whole, root)
     return root
 
 
@@ -90,7 +88,6 @@ def test_control_points_move_maps_exports_and_lineage(copied: Path, tmp_path: Pa
     assert {path: path.stat().st_mtime_ns for path in frames} == frames
     assert verify_run(run.layout, run.record) == []
     record = read_georeference(run.layout)
-    assert record is not None
     assert [estimate.source for estimate in record.scale.others] == ["given", "vehicles"]
     assert any("--gsd-m" in line for line in record.scale.disagreements)  # 0.23 was given
 
@@ -102,25 +99,19 @@ def test_points_that_cannot_be_used_change_nothing(copied: Path) -> None:
     assert {path: path.read_bytes() for path in copied.rglob("*.json")} == before
 
 
-def test_a_drones_telemetry_gives_scale_north_and_place(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def test_a_drones_telemetry_gives_scale_north_and_place(copy: Path, flight: Path, tmp_path: Path) -> None:
     """The base image of this run is the simulation's own, of 0.23 m a pixel, its top at a known heading."""
-    shutil.copytree(whole[0], tmp_path / "run")
     config = SimulationConfig.model_validate_json((flight / "simulation.json").read_text())
     simulated = Flight(config)
     subtitles = simulate_telemetry(config, simulated.camera, simulated.base_shape)
     text = srt_text((f"2026-05-04 12:00:00 {one}" for one in subtitles), simulated.times_s)
     (tmp_path / "x.SRT").write_text(text)
-    run = open_run(tmp_path / "run")
+    run = open_run(copy)
     plan = made_plan(run, Inputs(source=str(flight / "frames"), telemetry=str(tmp_path / "x.SRT")))
     done = georeference_run(plan)
-    grid, record = open_run(tmp_path / "run").grid, read_georeference(run.layout)
-    assert record is not None
-    assert record.scale.used is not None
+    grid, record = open_run(copy).grid, read_georeference(run.layout)
     assert record.scale.used.source == "metadata"
-    assert record.start is not None
-    assert open_run(tmp_path / "run").start == record.start
+    assert open_run(copy).start == record.start
     assert f"{record.start.time:%Y-%m-%d}" == "2026-05-04"
     assert grid.gsd_m == pytest.approx(0.23, rel=0.03)
     up = float(heading_deg(np.array([-np.pi / 2]), record.north_rad)[0])
@@ -132,17 +123,12 @@ def test_a_drones_telemetry_gives_scale_north_and_place(
     done = georeference_run(with_config(plan, gsd_m=0.23 * 1.2))
     assert any("by the metadata" in line for line in done.warnings)
     chosen = read_georeference(run.layout)
-    assert chosen is not None
-    assert isinstance(chosen.scale.used, ScaleEstimate)
     assert chosen.scale.used.source == "given"
 
 
-def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(copy: Path, flight: Path) -> None:
     """The flight's base image has 0.23 m a pixel."""
-    shutil.copytree(whole[0], tmp_path / "run")
-    run = open_run(tmp_path / "run")
+    run = open_run(copy)
     alone = made_plan(run, Inputs(source=str(flight / "frames")))
     warnings = {}
     for gsd_m in (None, 0.23, 0.23 * 1.2, 0.23 / 1.2):
@@ -151,13 +137,11 @@ def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(
         assert read_georeference(run.layout) == read_first_georeference(run.layout)
         warnings[gsd_m] = scale_run(plan).warnings
         record = read_georeference(run.layout)
-        assert record is not None
-        assert record.scale.used is not None
         assert record.scale.used.source == ("vehicles" if gsd_m is None else "given")
         if gsd_m is None:
             assert record.scale.used.gsd_m == pytest.approx(0.23, rel=0.06)
             assert record.scale.used.low_m < 0.23 < record.scale.used.high_m
-            assert open_run(tmp_path / "run").grid.gsd_m == record.scale.used.gsd_m
+            assert open_run(copy).grid.gsd_m == record.scale.used.gsd_m
             assert read_tracking_gsd(run.layout) is None  # its detector was trained with --gsd-m
     assert not warnings[None]
     assert not warnings[0.23]
@@ -166,21 +150,18 @@ def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(
 
 @pytest.mark.parametrize("factor", [1.0, 1.35, 5.0, 0.2])
 def test_metadata_that_the_cars_contradict_are_not_used(
-    factor: float, whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+    factor: float, copy: Path, flight: Path, tmp_path: Path
 ) -> None:
     """Heights are wrong by a factor, as by a unit or a zoom; what looks like a car does not depend on them."""
-    shutil.copytree(whole[0], tmp_path / "run")
     config = SimulationConfig.model_validate_json((flight / "simulation.json").read_text())
     simulated = Flight(config)
     text = srt_text(simulate_telemetry(config, simulated.camera, simulated.base_shape), simulated.times_s)
     wrong = re.sub(r"rel_alt: ([\d.]+)", lambda match: f"rel_alt: {float(match[1]) * factor:.3f}", text)
     (tmp_path / "x.SRT").write_text(wrong)
-    run = open_run(tmp_path / "run")
+    run = open_run(copy)
     plan = made_plan(run, Inputs(source=str(flight / "frames"), telemetry=str(tmp_path / "x.SRT")))
     first = georeference_run(plan)
     record = read_first_georeference(run.layout)
-    assert record is not None
-    assert record.scale.used is not None
     is_impossible = factor in (5.0, 0.2)  # at a third more the detector finds the same cars
     assert record.scale.used.source == ("vehicles" if is_impossible else "metadata")
     assert (sum("by the metadata: speeds" in line for line in first.warnings) == 1) == is_impossible
@@ -188,8 +169,6 @@ def test_metadata_that_the_cars_contradict_are_not_used(
         assert record.scale.used.gsd_m == pytest.approx(0.23, rel=0.2)
     done = scale_run(plan)
     record = read_georeference(run.layout)
-    assert record is not None
-    assert record.scale.used is not None
     assert record.scale.used.source == ("metadata" if factor == 1 else "vehicles")
     assert record.scale.used.gsd_m == pytest.approx(0.23, rel=0.06)
     assert sum("by the metadata: speeds" in line for line in done.warnings) == (factor != 1)
@@ -213,12 +192,9 @@ def stopping_street(gsd_m: float, fps: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_a_frame_rate_that_vehicles_contradict_is_reported(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def test_a_frame_rate_that_vehicles_contradict_is_reported(copy: Path, flight: Path) -> None:
     """Vehicles that set off in the images do so with four times the usual acceleration at twice the rate."""
-    shutil.copytree(whole[0], tmp_path / "run")
-    run = open_run(tmp_path / "run")
+    run = open_run(copy)
     made = made_plan(run, Inputs(source=str(flight / "frames")))
     for path in run.layout.tracks.glob("unit-*.parquet"):
         path.unlink()

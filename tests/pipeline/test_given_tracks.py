@@ -143,13 +143,13 @@ def test_the_run_has_its_vehicles_and_times(run: Run) -> None:
 
 def test_the_flow_writes_the_same_bits_and_repairs_what_was_damaged(run: Run, server: None, tmp_path: Path) -> None:
     from flows.console import Console
-    from flows.process_tracks import run_tracks
+    from flows.process_flight import run_flight
     from flows.runners import RunnerConfig
 
     path, said = write("metres", tmp_path / "t")
     root, config = tmp_path / "run", FlightConfig.model_validate({"gsd_m": GSD_M} | said)
     job = Job(root=str(root), inputs=Inputs(source=str(path)), config=config)
-    assert run_tracks(job, RunnerConfig(), Console("quiet")).complete
+    assert run_flight(job, RunnerConfig(), Console("quiet"), of_tracks=True).complete
     before, staged = digests(root), digests(run.layout.root)
     del staged["frames.zarr/zarr.json"]  # it has the path of the source
     assert {name: value for name, value in before.items() if name in staged} == staged

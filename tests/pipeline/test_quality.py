@@ -60,17 +60,16 @@ def damaged(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(damaged: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
-    root = tmp_path_factory.mktemp("quality") / "run"
-    return root, process(job(damaged, root))
+def run(damaged: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    return process(job(damaged, tmp_path_factory.mktemp("quality") / "run"))
 
 
-def test_they_are_flagged_and_no_other_frame_is(run: tuple[Path, RunSummary]) -> None:
-    assert open_run(run[0]).frames.column("flags").tolist() == EXPECTED
+def test_they_are_flagged_and_no_other_frame_is(run: RunSummary) -> None:
+    assert open_run(run.root).frames.column("flags").tolist() == EXPECTED
 
 
-def test_they_are_in_no_tracklet(run: tuple[Path, RunSummary]) -> None:
-    tracklets = open_run(run[0]).tracklets()
+def test_they_are_in_no_tracklet(run: RunSummary) -> None:
+    tracklets = open_run(run.root).tracklets()
     used = set(np.unique(tracklets[["frame_0", "frame_1", "frame_2"]].to_numpy()).tolist())
     assert used == set(range(COUNT)) - set(FAULTS)
     velocities = tracklets[[f"v{axis}_{link}_px_per_s" for axis in "xy" for link in ("01", "12")]].to_numpy()
@@ -78,22 +77,21 @@ def test_they_are_in_no_tracklet(run: tuple[Path, RunSummary]) -> None:
     assert np.isfinite(velocities).all()
 
 
-def test_they_are_reported(run: tuple[Path, RunSummary]) -> None:
-    root, summary = run
-    assert not summary.complete  # `velfield run` ends with status 3
-    assert [line.split(": ", 1)[1] for line in summary.frames_lost] == [
+def test_they_are_reported(run: RunSummary) -> None:
+    assert not run.complete  # `velfield run` ends with status 3
+    assert [line.split(": ", 1)[1] for line in run.frames_lost] == [
         f"skipped:{name}" for name in ("unreadable", "blurred", "outlier", "black", "duplicate", "unreadable")
     ]
-    (stage,) = [stage for stage in summary.stages if stage.name == "quality"]
+    (stage,) = [stage for stage in run.stages if stage.name == "quality"]
     assert stage.text.startswith(f"{COUNT - len(FAULTS)} frames usable, {len(FAULTS)} flagged: ")
-    warnings = [warning for stage in summary.stages for warning in stage.warnings]
+    warnings = [warning for stage in run.stages for warning in stage.warnings]
     assert {int(re.findall(r"^frame (\d+)", warning)[0]) for warning in warnings} == set(FAULTS)
     told = [warning for warning in warnings if warning.startswith(f"frame {DUPLICATE} (")]
     assert re.fullmatch(
         rf"frame {DUPLICATE} \(\d\.\d{{3}} s, source frame \S*{DUPLICATE}\.png\): the same image as the frame before",
         told[0],
     )
-    report = (root / "index.html").read_text()
+    report = Path(run.root, "index.html").read_text()
     assert all(warning in report for warning in warnings)
 
 
@@ -102,11 +100,10 @@ def test_flags_are_the_same_however_the_flight_is_cut(damaged: Path, tmp_path: P
     assert FrameStore(RunLayout(tmp_path / "run").frames).column("flags").tolist() == EXPECTED
 
 
-def test_no_frame_of_a_good_flight_is_flagged(whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_no_frame_of_a_good_flight_is_flagged(whole: Path) -> None:
+    run = open_run(whole)
     assert not run.frames.column("flags").any()
     record = read_commit(run.layout, "quality", "all")
-    assert record is not None
     assert (record.counts["usable"], record.counts["flagged"]) == (FRAMES, 0)
 
 
@@ -160,7 +157,7 @@ def test_frames_of_a_damaged_bitstream_are_in_no_tracklet(clip: Clip) -> None:
 
 
 def test_where_no_control_points_support_the_map_nothing_is_detected_tracked_or_counted(
-    clip: Clip, whole: tuple[Path, RunSummary]
+    clip: Clip, whole: Path
 ) -> None:
     """Vehicles drive in the blank part of the base image too: the flight shows them, and the map does not bear them."""
     run = open_run(clip.plan.layout.root)
@@ -171,7 +168,7 @@ def test_where_no_control_points_support_the_map_nothing_is_detected_tracked_or_
         "field": float(np.flatnonzero(run.field.count().any(axis=0)).max()),
     }
     beyond = clip.blank_from_px + reach(640, 480)
-    whole_run = open_run(whole[0])
+    whole_run = open_run(whole)
     assert (whole_run.detections()["x_px"] > beyond + 20).sum() > 100
     assert np.flatnonzero(whole_run.field.count().any(axis=0)).max() > beyond + 50
     assert {name: x for name, x in last_px.items() if x > beyond + 3} == {}

@@ -1,6 +1,5 @@
 """Damage: every flipped bit and every missing chunk is named, and only the units it is in are done again."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from flows.commands.verify import verify
 from flows.console import Console
 from flows.process_flight import record_start
-from schemas.summary import RunSummary
 from tests.faults.flipped_bits import flip_bits
 from tests.small_flight import digests, job
 from velfield import open_run
@@ -22,13 +20,6 @@ from velfield.run.commits import commit_path, read_commit, read_commits
 from velfield.run.layout import RunLayout
 
 FLIPS, SEED = 200, 25
-
-
-@pytest.fixture
-def copy(whole: tuple[Path, RunSummary], tmp_path: Path) -> Path:
-    """A run that may be damaged."""
-    shutil.copytree(whole[0], tmp_path / "run")
-    return tmp_path / "run"
 
 
 def flip_a_bit(path: Path, rng: np.random.Generator) -> None:
@@ -167,7 +158,7 @@ def test_reading_a_damaged_chunk_raises_and_names_it(copy: Path) -> None:
 
 
 def test_only_the_damaged_units_are_recomputed_with_equal_results(
-    copy: Path, whole: tuple[Path, RunSummary], capsys: pytest.CaptureFixture[str]
+    copy: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path: path.stat().st_mtime_ns for path in (copy / "commits").rglob("*.json")}
     rng = np.random.default_rng(1)
@@ -177,7 +168,7 @@ def test_only_the_damaged_units_are_recomputed_with_equal_results(
     assert verify(copy) == 3
     assert verify(copy, repair=True) == 0
     assert capsys.readouterr().out.strip().endswith(f"{copy}: whole")
-    assert digests(copy) == digests(whole[0])
+    assert digests(copy) == digests(whole)
     again = {
         path.relative_to(copy / "commits").as_posix() for path in before if path.stat().st_mtime_ns != before[path]
     }
@@ -185,16 +176,14 @@ def test_only_the_damaged_units_are_recomputed_with_equal_results(
     assert again == {f"{unit}.json" for unit in (*units, "page/all")}  # every run writes the page again
 
 
-def test_what_no_unit_writes_and_what_an_earlier_stage_reads_are_repaired(
-    copy: Path, whole: tuple[Path, RunSummary]
-) -> None:
+def test_what_no_unit_writes_and_what_an_earlier_stage_reads_are_repaired(copy: Path, whole: Path) -> None:
     """Coordinates, which are written with their store; the scale of the last run, which registration reads."""
     rng = np.random.default_rng(2)
     for name in ("field.zarr/y/c/0", "field.zarr/vx_m_per_s/c/0", "commits/registration/000000-000007.json"):
         flip_a_bit(copy / name, rng)
     (copy / "base/scale.json").write_text("{")
     assert verify(copy, repair=True) == 0
-    assert digests(copy) == digests(whole[0])
+    assert digests(copy) == digests(whole)
 
 
 def test_a_store_whose_metadata_is_damaged_is_recreated(copy: Path) -> None:

@@ -87,7 +87,6 @@ def test_the_transforms_come_back_and_a_frame_without_one_has_none(layout: RunLa
     assert transforms.transform(1) is None
     for frame, expected in ((0, similarity(1.1, 0.1, (5, 7))), (2, similarity(0.9, -0.2, (0, 3)))):
         found = transforms.transform(frame)
-        assert found is not None
         assert transforms.transform(frame) is found, "it is kept"
         np.testing.assert_array_equal(found.to_base(points()), frame_transform(expected).to_base(points()))
         np.testing.assert_allclose(found.to_raw(found.to_base(points())), points(), atol=1e-6)
@@ -110,8 +109,6 @@ def test_base_images_given_later_are_applied_after_a_frames_own(layout: RunLayou
     )
     layout.rebased.write_text(rebase.model_dump_json())
     composed = FrameTransforms.open(layout, CONFIG).transform(0)
-    assert own is not None
-    assert composed is not None
     xy = points()
     np.testing.assert_allclose(composed.to_base(xy), to_newer(to_given(own.to_base(xy))), atol=1e-9)
     np.testing.assert_allclose(composed.to_raw(composed.to_base(xy)), xy, atol=1e-6)
@@ -129,7 +126,6 @@ def test_the_map_to_a_given_image_has_a_mesh_and_a_standard_deviation_that_both_
     store.write(0, store.column("vector", 0, 3), store.statuses(), {"position_sd_px": own_sd})
     frames = FrameTransforms.open(layout, CONFIG)
     transform, xy = frames.transform(0), np.array([[40.0, 60.0], [300.0, 60.0]])
-    assert transform is not None
     own = frame_transform(similarity(1.1, 0.1, (5, 7))).to_base(xy)
     np.testing.assert_allclose(transform.to_base(xy), to_given(own), atol=1e-9)
     np.testing.assert_allclose(transform.to_raw(transform.to_base(xy)), xy, atol=2e-3)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from flows.commands.lineage import lineage
-from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.pipeline.stage import STAGE
@@ -17,15 +16,15 @@ from velfield.run.lineage import pixel_lineage, stage_lineage
 
 
 @pytest.fixture
-def pixel(whole: tuple[Path, RunSummary]) -> tuple[int, int]:
+def pixel(whole: Path) -> tuple[int, int]:
     """The busiest pixel, (x, y)."""
-    count = open_run(whole[0]).field.count()
+    count = open_run(whole).field.count()
     y, x = np.unravel_index(count.argmax(), count.shape)
     return int(x), int(y)
 
 
-def test_as_many_vehicles_as_the_field_counts(whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_as_many_vehicles_as_the_field_counts(whole: Path) -> None:
+    run = open_run(whole)
     count = run.field.count()
     rng = np.random.default_rng(0)
     ys, xs = np.nonzero(count)
@@ -38,10 +37,8 @@ def test_as_many_vehicles_as_the_field_counts(whole: tuple[Path, RunSummary]) ->
     assert found == [int(count[y, x]) for x, y in places]
 
 
-def test_the_frames_are_those_of_the_tracklets_with_their_true_times(
-    whole: tuple[Path, RunSummary], pixel: tuple[int, int]
-) -> None:
-    run = open_run(whole[0])
+def test_the_frames_are_those_of_the_tracklets_with_their_true_times(whole: Path, pixel: tuple[int, int]) -> None:
+    run = open_run(whole)
     found = pixel_lineage(run, *pixel)
     tracklets = run.tracklets().set_index("tracklet_id")
     ids = [tracklet for track in found.tracks for tracklet in track.tracklets]
@@ -51,34 +48,32 @@ def test_the_frames_are_those_of_the_tracklets_with_their_true_times(
     assert all(0 < frame.heldout_px < 2 for frame in found.frames)
 
 
-def test_the_chain_of_stages(whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_the_chain_of_stages(whole: Path) -> None:
+    run = open_run(whole)
     stages = stage_lineage(run)
     assert [stage.name for stage in stages] == list(STAGE)
     assert {stage.name: stage.key for stage in stages} == run.record.keys
 
 
-def test_the_command_prints_it(
-    whole: tuple[Path, RunSummary], pixel: tuple[int, int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    root, (x, y) = whole[0], pixel
-    assert lineage(root) == lineage(root, str(x), y) == lineage(root, f"{x},{y}") == 0
+def test_the_command_prints_it(whole: Path, pixel: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
+    x, y = pixel
+    assert lineage(whole) == lineage(whole, str(x), y) == lineage(whole, f"{x},{y}") == 0
     printed = capsys.readouterr().out
-    assert digest_file(root / "detector.json") in printed
-    assert digest_file(root / "base/base_image.png") in printed
+    assert digest_file(whole / "detector.json") in printed
+    assert digest_file(whole / "base/base_image.png") in printed
     assert "labelled cars" in printed
-    lineage(root, pixel=f"{x},{y}", as_json=True)
+    lineage(whole, pixel=f"{x},{y}", as_json=True)
     assert json.loads(capsys.readouterr().out)["x"] == x
 
 
 @pytest.mark.parametrize("wrong", ["7", "7,a", "-1,5", "9999,5"])
-def test_a_pixel_that_is_none_is_refused(whole: tuple[Path, RunSummary], wrong: str) -> None:
+def test_a_pixel_that_is_none_is_refused(whole: Path, wrong: str) -> None:
     with pytest.raises(InputError, match=r"pixel"):
-        lineage(whole[0], pixel=wrong)
+        lineage(whole, pixel=wrong)
 
 
-def test_a_run_converts_to_metres_where_its_scale_is_known(whole: tuple[Path, RunSummary]) -> None:
-    run = open_run(whole[0])
+def test_a_run_converts_to_metres_where_its_scale_is_known(whole: Path) -> None:
+    run = open_run(whole)
     assert run.gsd_m == run.grid.gsd_m
     np.testing.assert_allclose(run.to_metres([[0, 0], [412, 300]]), [[0, 0], [412 * run.gsd_m, 300 * run.gsd_m]])
     assert run.to_metres([2, 0]).shape == run.to_base(0, [100, 100]).shape == (1, 2)

@@ -11,7 +11,6 @@ from flows.console import Console
 from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig
 from schemas.records import ResultsRecord
-from schemas.summary import RunSummary
 from tests.foreign_cluster import foreign_cluster
 from tests.new_base import write_new_base
 from tests.small_flight import digests, digests_of, job, process, redone
@@ -26,19 +25,16 @@ from velfield.run.s3 import S3_OPTIONS
 
 
 @pytest.fixture(scope="module")
-def remote(
-    s3: None, whole: tuple[Path, RunSummary], flight: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, RunSummary]:
+def remote(s3: None, whole: Path, flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The flight's run on S3, worked on by processes in folders of their own that have nothing but that in common.
 
     All stores are written there; only lens, base image and detector are taken from the disk.
     """
     root = to_path("s3://flights/runs/whole")
-    link_shared_outputs(
-        RunLayout(whole[0]), RunLayout(to_path("s3://flights/runs/whole")), ("lens", "base", "detector")
-    )
+    link_shared_outputs(RunLayout(whole), RunLayout(root), ("lens", "base", "detector"))
     with foreign_cluster(tmp_path_factory.mktemp("cluster")) as address:
-        return root, process(job(flight, root), RunnerConfig(scheduler=address))
+        assert process(job(flight, root), RunnerConfig(scheduler=address)).complete
+    return root
 
 
 def remote_digests(root: Path) -> dict[str, str]:
@@ -48,9 +44,8 @@ def remote_digests(root: Path) -> dict[str, str]:
     return digests_of(root, {to_path(f"s3://{key}"): data for key, data in objects.items()})
 
 
-def test_the_same_bits_as_on_a_disk(remote: tuple[Path, RunSummary], whole: tuple[Path, RunSummary]) -> None:
-    assert remote[1].complete
-    assert remote_digests(remote[0]) == digests(whole[0])
+def test_the_same_bits_as_on_a_disk(remote: Path, whole: Path) -> None:
+    assert remote_digests(remote) == digests(whole)
 
 
 def test_a_bucket_that_is_not_there_is_refused_before_anything_starts(s3: None, flight: Path) -> None:
@@ -59,37 +54,34 @@ def test_a_bucket_that_is_not_there_is_refused_before_anything_starts(s3: None, 
         make_plan(work)
 
 
-def test_a_second_run_recomputes_nothing(remote: tuple[Path, RunSummary], flight: Path) -> None:
-    assert redone(process(job(flight, remote[0]))) == []
+def test_a_second_run_recomputes_nothing(remote: Path, flight: Path) -> None:
+    assert redone(process(job(flight, remote))) == []
 
 
-def test_it_is_read_and_verified_from_there(remote: tuple[Path, RunSummary], whole: tuple[Path, RunSummary]) -> None:
-    run, here = open_run("s3://flights/runs/whole"), open_run(whole[0])
+def test_it_is_read_and_verified_from_there(remote: Path, whole: Path) -> None:
+    run, here = open_run("s3://flights/runs/whole"), open_run(whole)
     np.testing.assert_array_equal(run.field.modal_velocity(), here.field.modal_velocity())
     assert run.tracklets().equals(here.tracklets())
     assert (run.base_image == here.base_image).all()
     assert verify_run(run.layout, run.record) == []
-    chunk = remote[0] / "frames.zarr/raw/c/5/0/0"
+    chunk = remote / "frames.zarr/raw/c/5/0/0"
     data = chunk.read_bytes()
     chunk.write_bytes(data[:50] + bytes([data[50] ^ 1]) + data[51:])
     assert [damage.path for damage in verify_run(run.layout, run.record)] == ["frames.zarr/raw/c/5/0/0"]
     chunk.write_bytes(data)
 
 
-def test_a_new_base_image_under_a_run_that_is_there(
-    remote: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
+def test_a_new_base_image_under_a_run_that_is_there(remote: Path, flight: Path, tmp_path: Path) -> None:
     base = write_new_base(flight, tmp_path / "spring.png")
     there, summary = run_reprocess(Path("s3://flights/runs/whole"), base, console=Console("quiet"))
-    assert summary is not None
     assert summary.complete
-    assert there == remote[0] / "results/spring"
+    assert there == remote / "results/spring"
     result = open_run("s3://flights/runs/whole/results/spring")
     assert verify_run(result.layout, result.record) == []
     assert len(result.tracklets()) == len(open_run("s3://flights/runs/whole").tracklets())
-    index = ResultsRecord.model_validate_json((remote[0] / "results.json").read_bytes())
+    index = ResultsRecord.model_validate_json((remote / "results.json").read_bytes())
     assert [found.name for found in index.results] == ["first", "spring"]
-    assert not list(remote[0].glob("results/.spring*/**"))
+    assert not list(remote.glob("results/.spring*/**"))
 
 
 def test_a_folder_whose_naming_was_cut_short_has_no_last_file_and_is_named_again(

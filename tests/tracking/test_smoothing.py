@@ -45,7 +45,6 @@ def test_errors_are_measured_and_made_smaller(noise: Noise) -> None:
     tracks = driven()
     seen = add_noise(tracks, noise, seed=1)
     errors = measure_errors(tracks.first, tracks.time_s, seen)
-    assert errors is not None
     assert errors.total_m == pytest.approx(np.hypot(noise.white_m, noise.lasting_m), rel=0.35)
     smoothed, position_sd_m, _ = smooth_paths(tracks.first, tracks.time_s, seen, errors)
     left, before = (float(np.sqrt(np.mean((xy - tracks.xy_m) ** 2))) for xy in (smoothed, seen))

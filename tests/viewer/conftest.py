@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from schemas.summary import RunSummary
 from tests.browser import Browser, browser, served
 from velfield import open_run
 from velfield.run.run import Run
@@ -18,22 +17,22 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def run(whole: tuple[Path, RunSummary]) -> Run:
-    return open_run(whole[0])
+def run(whole: Path) -> Run:
+    return open_run(whole)
 
 
 @pytest.fixture(scope="module")
-def address(whole: tuple[Path, RunSummary]) -> Iterator[str]:
+def address(whole: Path) -> Iterator[str]:
     """The run folder behind Python's plain static server."""
-    with served(whole[0]) as there:
+    with served(whole) as there:
         yield there
 
 
 @pytest.fixture
-def linked(whole: tuple[Path, RunSummary], tmp_path: Path) -> Path:
+def linked(whole: Path, tmp_path: Path) -> Path:
     """The run folder as links, in which a test may put files in the place of others."""
     (tmp_path / "view").mkdir()
-    for path in (*whole[0].iterdir(), *(whole[0] / "view").iterdir()):
+    for path in (*whole.iterdir(), *(whole / "view").iterdir()):
         if path.name != "view":
-            (tmp_path / path.relative_to(whole[0])).symlink_to(path)
+            (tmp_path / path.relative_to(whole)).symlink_to(path)
     return tmp_path

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from schemas.summary import RunSummary
 from tests.browser import NEEDS_PAGE, Browser, served
 from velfield import open_run
 
@@ -19,12 +18,10 @@ pytestmark = [
 
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(1400, 900, "light"), (390, 800, "dark")])
-def test_axe_has_no_findings(
-    chromium: Browser, whole: tuple[Path, RunSummary], width: int, height: int, scheme: str
-) -> None:
-    count = open_run(whole[0]).field.count()
+def test_axe_has_no_findings(chromium: Browser, whole: Path, width: int, height: int, scheme: str) -> None:
+    count = open_run(whole).field.count()
     y, x = divmod(int(count.argmax()), count.shape[1])
-    with served(whole[0]) as address, chromium.page(width=width, height=height) as page:
+    with served(whole) as address, chromium.page(width=width, height=height) as page:
         page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         for state, ready in (
             (f"pixel={x},{y}&replay=1", "document.querySelector('#answer details.tracks') !== null"),

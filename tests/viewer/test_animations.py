@@ -20,7 +20,6 @@ from schemas.analysis import (
     NameRecord,
 )
 from schemas.arrays import IntArray
-from schemas.summary import RunSummary
 from schemas.view import ViewRecord
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, served
 from velfield.analysis.vehicle_classes import CLASS_NAMES
@@ -47,8 +46,8 @@ PAINTED_PX = f"document.querySelector('canvas.animation') !== null && ({PAINTED}
 
 
 @pytest.fixture(scope="module")
-def record(whole: tuple[Path, RunSummary]) -> ViewRecord:
-    return ViewRecord.model_validate_json(RunLayout(whole[0]).view_record.read_bytes())
+def record(whole: Path) -> ViewRecord:
+    return ViewRecord.model_validate_json(RunLayout(whole).view_record.read_bytes())
 
 
 def decode(data: bytes, step_px: float) -> dict[int, dict[str, np.ndarray]]:
@@ -350,12 +349,10 @@ def test_where_less_motion_is_asked_for_nothing_flows(chromium: Browser, address
 
 @NEEDS_PAGE
 @pytest.mark.parametrize(("ratio", "zoom"), [(1, -0.25), (1.25, 0), (1.5, 0.25)])
-def test_no_seam_shows_between_tiles(
-    chromium: Browser, whole: tuple[Path, RunSummary], linked: Path, ratio: float, zoom: float
-) -> None:
+def test_no_seam_shows_between_tiles(chromium: Browser, whole: Path, linked: Path, ratio: float, zoom: float) -> None:
     (linked / "view" / "base").unlink()
-    for path in (whole[0] / "view" / "base").rglob("*.jpg"):
-        even = linked / path.relative_to(whole[0])
+    for path in (whole / "view" / "base").rglob("*.jpg"):
+        even = linked / path.relative_to(whole)
         even.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(even), np.full_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 220))
     with served(linked) as there, chromium.page(width=700, height=500) as page:

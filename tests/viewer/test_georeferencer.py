@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from rasterio.warp import transform
 
 from flows.cli import app
 from schemas.georeference import ControlPoint, ControlPointsRecord, MarkedPoint, MarkedPoints
-from schemas.summary import RunSummary
 from tests.browser import NEEDS_PAGE, Page, browser
 from tests.viewer.test_accessibility import AXE, FINDINGS
 from tests.viewer.test_reference_map import squares, write_geotiff
@@ -48,7 +46,6 @@ GOOD = tuple(lonlat(x, y) for x, y in PIXELS)
 
 def token_of(client: Client) -> dict[str, str]:
     found = re.search(r'id="server-data">(.*?)</script>', client.ask("/")[1])
-    assert found is not None
     return {"X-Token": json.loads(found.group(1))["token"]}
 
 
@@ -77,32 +74,28 @@ def made_app(
 
 
 @NEEDS_PAGE
-def test_the_page_of_a_run_fits_saves_and_begins_with_what_was_saved(
-    whole: tuple[Path, RunSummary], tmp_path: Path
-) -> None:
-    root = tmp_path / "run"
-    shutil.copytree(whole[0], root)
-    before, registered = files(root), files(root / "registration")
-    with command("georeference", str(root)) as address:
+def test_the_page_of_a_run_fits_saves_and_begins_with_what_was_saved(copy: Path) -> None:
+    before, registered = files(copy), files(copy / "registration")
+    with command("georeference", str(copy)) as address:
         client = Client(int(address.rstrip("/").rpartition(":")[2]))
         token = token_of(client)
         status, text, _ = client.ask("/fit", "POST", token, body(*GOOD))
         assert status == 200
         fit = json.loads(text)
-        run = open_run(root)
+        run = open_run(copy)
         expected = fit_run_points(run, *read_marked_points(MarkedPoints.model_validate_json(body(*GOOD))))
         assert fit["text"] == expected.text()
         assert [point["residual_m"] for point in fit["residuals"]] == [e.residual_m for e in expected.residuals]
-        assert files(root) == before  # the fit writes nothing
+        assert files(copy) == before  # the fit writes nothing
         assert client.status("/save", "POST", token, body(*GOOD[:2])) == 422
-        assert files(root) == before
+        assert files(copy) == before
         status, text, _ = client.ask("/save", "POST", token, body(*GOOD))
         assert status == 200
         assert json.loads(text)["text"] == expected.text()
-        assert open_run(root).grid.gsd_m == pytest.approx(GSD_M, rel=2e-3)
-        assert open_run(root).grid.crs_wkt is not None
-        assert files(root / "registration") == registered
-    record = ControlPointsRecord.model_validate_json((root / "base" / "control_points.json").read_bytes())
+        assert open_run(copy).grid.gsd_m == pytest.approx(GSD_M, rel=2e-3)
+        assert open_run(copy).grid.crs_wkt is not None
+        assert files(copy / "registration") == registered
+    record = ControlPointsRecord.model_validate_json((copy / "base" / "control_points.json").read_bytes())
     read, code = read_marked_points(marked_points(record, None))
     assert (read, code) == (record.points, 4326)
 

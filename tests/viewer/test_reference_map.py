@@ -70,7 +70,6 @@ def web_pixel(longitude: float, latitude: float, zoom: int) -> tuple[int, int, i
 def colour_at(reference: ReferenceMap, longitude: float, latitude: float, zoom: int) -> NDArray[np.uint8]:
     column, row, x, y = web_pixel(longitude, latitude, zoom)
     tile = reference.tile(zoom, column, row)
-    assert tile is not None
     assert (tile.shape, tile.dtype) == ((256, 256, 4), np.uint8)
     return np.asarray(tile[y, x], np.uint8)
 
@@ -99,7 +98,6 @@ def test_a_geotiffs_tiles_show_each_place_where_it_is(tmp_path: Path, bands: int
         np.testing.assert_allclose(shown[:3].astype(float), np.broadcast_to(expected, 3), atol=1.5)
         assert shown[3] == 255
     elsewhere = reference.tile(reference.native_zoom, 0, 0)
-    assert elsewhere is not None
     assert not elsewhere.any()
     for zoom, column, row in ((-1, 0, 0), (2, 4, 0), (2, 0, -1), (25, 0, 0), (10**6, 1, 1)):
         assert reference.tile(zoom, column, row) is None
@@ -110,7 +108,6 @@ def test_a_tile_with_the_maps_edge_is_transparent_beyond_it(tmp_path: Path) -> N
     west, _, _, north = reference.bounds
     column, row, x, y = web_pixel(west, north, reference.native_zoom)
     tile = reference.tile(reference.native_zoom, column, row)
-    assert tile is not None
     assert 0 < x < 250  # the test is of an edge within the tile
     assert not tile[: max(y - 2, 0), :, 3].any()
     assert not tile[:, : max(x - 2, 0), 3].any()
@@ -144,11 +141,9 @@ def test_mbtiles_are_shown_as_they_are(tmp_path: Path) -> None:
     assert reference.native_zoom == zoom
     for key, image in images.items():
         tile = reference.tile(*key)
-        assert tile is not None
         np.testing.assert_array_equal(tile[..., :3], image)
         assert tile[..., 3].min() == 255
     beside = reference.tile(zoom, column + 4, row)
-    assert beside is not None
     assert not beside.any()
     west, _, _, north = reference.bounds
     assert web_pixel(west + 1e-6, north - 1e-6, zoom)[:2] == (column, row)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.summary import RunSummary
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, served
 from velfield.analysis import coverage
 from velfield.report.figures import colour_scale_max, round_up
@@ -231,9 +230,9 @@ def test_the_labels_of_a_histogram_do_not_touch(page: Page, address: str, run: R
 
 
 def test_the_page_colours_speeds_as_the_figure_does_and_notes_what_is_cut_off(
-    page: Page, address: str, whole: tuple[Path, RunSummary]
+    page: Page, address: str, whole: Path
 ) -> None:
-    store = FieldStore(RunLayout(whole[0]).field)
+    store = FieldStore(RunLayout(whole).field)
     modal = np.hypot(store.layer("modal_vx"), store.layer("modal_vy")).astype(np.float64) * 0.23 * 3.6
     reach = colour_scale_max(modal)
     assert reach is not None
@@ -451,9 +450,9 @@ def test_a_small_screen_shows_it_without_scrolling_sideways(
             assert small.value("map.getBoundingClientRect().height") > 300
 
 
-def test_opened_from_the_disk_it_names_the_command(chromium: Browser, whole: tuple[Path, RunSummary]) -> None:
+def test_opened_from_the_disk_it_names_the_command(chromium: Browser, whole: Path) -> None:
     with chromium.page() as opened:
-        opened.open((whole[0] / "index.html").as_uri())
+        opened.open((whole / "index.html").as_uri())
         opened.wait("document.querySelector('#map .alarm') !== null")
         assert "velfield view RUN" in opened.value("document.querySelector('#map .alarm').textContent")
         assert opened.value("document.getElementById('summary-panel').hidden") is False

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.summary import RunSummary
 from schemas.view import ViewRecord
 from tests.browser import NEEDS_PAGE
 from tests.small_flight import job, process
@@ -65,10 +64,10 @@ def test_an_interval_and_one_false_track_do_not_set_the_scale_of_speeds() -> Non
     assert (layers["speed"].data_max, layers["speed_p50_ci90_upper"].data_max) == (300, 60)
 
 
-def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None:
-    layout = RunLayout(whole[0])
+def test_the_record_lists_what_is_stored(whole: Path) -> None:
+    layout = RunLayout(whole)
     record = ViewRecord.model_validate_json(layout.view_record.read_bytes())
-    run = open_run(whole[0])
+    run = open_run(whole)
     assert (record.height_px, record.width_px) == run.field.shape
     assert record.gsd_m == 0.23
     assert run.record.config.field.lane_width_m / 4 / 0.23 == pytest.approx(record.segments.band_radius_px)
@@ -86,10 +85,10 @@ def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None
         assert len(listed) == len(list(chunks.glob("*/*")))
 
 
-def test_what_compare_left_is_shown(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+def test_what_compare_left_is_shown(whole: Path, tmp_path: Path) -> None:
     root = tmp_path / "run"
-    shutil.copytree(whole[0], root, ignore=shutil.ignore_patterns("raw"))
-    compare_runs(whole[0], root, tmp_path / "comparison")
+    shutil.copytree(whole, root, ignore=shutil.ignore_patterns("raw"))
+    compare_runs(whole, root, tmp_path / "comparison")
     record = ViewRecord.model_validate_json(RunLayout(root).view_record.read_bytes())
     changes = [layer for layer in record.layers if layer.kind == "change"]
     assert [layer.name for layer in changes] == ["direction_change", "speed_change", "volume_change"]
@@ -99,37 +98,35 @@ def test_what_compare_left_is_shown(whole: tuple[Path, RunSummary], tmp_path: Pa
     assert (root / record.arrays["speed_change"].store / "speed_change" / "zarr.json").is_file()
 
 
-def test_the_report_goes_by_mail(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
-    page = export_run(open_run(whole[0]), "report", tmp_path / "report.html").read_text()
+def test_the_report_goes_by_mail(whole: Path, tmp_path: Path) -> None:
+    page = export_run(open_run(whole), "report", tmp_path / "report.html").read_text()
     assert page.count("data:image/jpeg;base64,") >= 2
-    assert "clockwise from the top of the image" in (whole[0] / "index.html").read_text()
+    assert "clockwise from the top of the image" in (whole / "index.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "<script" not in page
     assert "Direction of travel" in page
 
 
 def test_without_a_built_page_the_report_stands_alone_and_it_is_said(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    copy: Path, flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from flows.console import Console
 
     warnings: list[str] = []
     monkeypatch.setattr(Console, "warn", lambda self, text: warnings.append(text))
     monkeypatch.setattr(report_step, "page_is_built", lambda: False)
-    root = tmp_path / "run"
-    shutil.copytree(whole[0], root)
-    process(job(flight, root))
+    process(job(flight, copy))
     assert any("make page" in line for line in warnings)
-    page = (root / "index.html").read_text()
+    page = (copy / "index.html").read_text()
     assert "<script" not in page
     assert "Direction of travel" in page
 
 
 @NEEDS_PAGE
-def test_the_page_holds_its_licences_and_no_address_elsewhere(whole: tuple[Path, RunSummary]) -> None:
-    licences = (whole[0] / "view" / "LICENSES.txt").read_text()
+def test_the_page_holds_its_licences_and_no_address_elsewhere(whole: Path) -> None:
+    licences = (whole / "view" / "LICENSES.txt").read_text()
     for package in ("leaflet", "zarrita", "zstddec"):
         assert f"{package} " in licences
     assert "Redistribution" in licences
-    page = re.sub(r"<script>.*?</script>", "", (whole[0] / "index.html").read_text(), flags=re.DOTALL)
+    page = re.sub(r"<script>.*?</script>", "", (whole / "index.html").read_text(), flags=re.DOTALL)
     assert not re.findall(r'(?:src|href)="(?:https?:)?//', page)

@@ -17,7 +17,6 @@ import pytest
 
 from schemas.annotation import MarkedCar, Marks
 from schemas.flight import FramesConfig
-from schemas.summary import RunSummary
 from tests.browser import NEEDS_PAGE, browser
 from velfield.errors import InputError
 from velfield.report.figures import png_bytes
@@ -136,9 +135,7 @@ def command(*arguments: str) -> Iterator[str]:
     line = [sys.executable, "-m", "flows.cli", *arguments, "--no-open"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
-            assert process.stdout is not None
             found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
-            assert found is not None
             yield found.group()
         finally:
             process.send_signal(signal.SIGINT)
@@ -146,8 +143,8 @@ def command(*arguments: str) -> Iterator[str]:
 
 
 @NEEDS_PAGE
-def test_view_serves_the_page(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
-    with command("view", str(whole[0])) as address, browser(tmp_path / "profile") as chromium, chromium.page() as page:
+def test_view_serves_the_page(whole: Path, tmp_path: Path) -> None:
+    with command("view", str(whole)) as address, browser(tmp_path / "profile") as chromium, chromium.page() as page:
         page.open(address)
         page.wait("document.querySelector('.overlay .leaflet-tile-loaded') !== null")
         assert page.complaints == []
@@ -241,7 +238,6 @@ def test_only_the_page_it_served_may_write(tmp_path: Path) -> None:
         assert client.status("/labels", "POST", {"X-Token": "guess"}, body) == 403
         assert not path.exists()
         found = re.search(r'id="server-data">(.*?)</script>', client.ask("/")[1])
-        assert found is not None
         token = {"X-Token": json.loads(found.group(1))["token"]}
         assert client.status("/labels", "POST", {**token, "Host": "elsewhere.example"}, body) == 400
         assert client.status("/labels", "POST", token, "{}") == 422
@@ -252,16 +248,16 @@ def test_only_the_page_it_served_may_write(tmp_path: Path) -> None:
     assert path.exists()
 
 
-def test_a_run_offers_frames_spread_over_the_flight(whole: tuple[Path, RunSummary], flight: Path) -> None:
-    offered = frames_to_annotate(whole[0], max_frames=4)
+def test_a_run_offers_frames_spread_over_the_flight(whole: Path, flight: Path) -> None:
+    offered = frames_to_annotate(whole, max_frames=4)
     names = sorted(path.name for path in (flight / "frames").iterdir())
     assert len(offered.names) == 4
     assert (offered.names[0], offered.names[-1]) == (names[0], names[-1])
     assert offered.read(1).shape == (offered.height, offered.width) == (480, 640)
 
 
-def test_a_frame_begins_with_the_vehicles_that_the_run_tracks(whole: tuple[Path, RunSummary]) -> None:
-    run, offered = open_run(whole[0]), frames_to_annotate(whole[0], max_frames=4)
+def test_a_frame_begins_with_the_vehicles_that_the_run_tracks(whole: Path) -> None:
+    run, offered = open_run(whole), frames_to_annotate(whole, max_frames=4)
     seen = run.track_positions()
     seen = seen[(seen["frame"] == 0) & (seen["source"] != "interpolated")]
     seen = seen.merge(run.vehicles()[["track_id", "length_px"]], on="track_id")
@@ -275,9 +271,9 @@ def test_a_frame_begins_with_the_vehicles_that_the_run_tracks(whole: tuple[Path,
 
 
 @NEEDS_PAGE
-def test_what_the_run_found_is_no_label_before_it_is_confirmed(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+def test_what_the_run_found_is_no_label_before_it_is_confirmed(whole: Path, tmp_path: Path) -> None:
     labels = tmp_path / "labels.csv"
-    arguments = ("annotate", str(whole[0]), "--labels", str(labels), "--frames", "2")
+    arguments = ("annotate", str(whole), "--labels", str(labels), "--frames", "2")
     with command(*arguments) as address, browser(tmp_path / "profile") as chromium, chromium.page() as page:
         page.open(address)
         page.wait("document.getElementById('saved').textContent.includes('found by the run and not saved')")

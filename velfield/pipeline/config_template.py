@@ -1,6 +1,5 @@
 """A commented ``flight.yaml`` to start from: the properties of the source, and every key with its default."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -48,8 +47,15 @@ def config_template(source: str, info: SourceInfo) -> str:
         *_comment(_GSD, ""),
         "# gsd_m: 0.23",
     ]
-    for name, section in _sections(config):
-        lines += ["", *_comment(type(section).__doc__ or "", ""), f"{name}:", *_keys(section), *_of_other_methods(name)]
+    for name in type(config).model_fields:
+        if isinstance(section := getattr(config, name), BaseModel):
+            lines += [
+                "",
+                *_comment(type(section).__doc__ or "", ""),
+                f"{name}:",
+                *_keys(section),
+                *_of_other_methods(name),
+            ]
     return "\n".join(lines) + "\n"
 
 
@@ -92,13 +98,6 @@ def describe_source(info: SourceInfo, config: FlightConfig) -> list[str]:
         taken = select_frames(info.times_s, config.frames)
         lines.append(f"With every: auto, {len(taken)} frames are processed, those nearest to 0.2 s apart.")
     return [*lines, *(f"Warning: {warning}" for warning in info.warnings)]
-
-
-def _sections(config: FlightConfig) -> Iterator[tuple[str, BaseModel]]:
-    for name in type(config).model_fields:
-        value = getattr(config, name)
-        if isinstance(value, BaseModel):
-            yield name, value
 
 
 def _keys(section: BaseModel, indent: str = "  ") -> list[str]:

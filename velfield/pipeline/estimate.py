@@ -8,7 +8,7 @@ from pathlib import Path
 from velfield.errors import InputError, is_disk_full
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
-from velfield.pipeline.stage import STAGES, Cut, Stage
+from velfield.pipeline.stage import STAGES, Cut
 from velfield.pipeline.units import group_name, stage_units, unit_name
 from velfield.run.layout import is_remote
 from velfield.run.stores import FIELD_BLOCK, GROUP_TILES
@@ -26,15 +26,11 @@ _MEMORY_BYTES_A_PIXEL = 350
 
 def planned_units(plan: Plan) -> dict[str, list[str]]:
     """Names of every stage's units; those by tiles are an estimate until the base image's size is known."""
-    return {stage.name: _unit_names(plan, stage) for stage in STAGES}
-
-
-def _unit_names(plan: Plan, stage: Stage) -> list[str]:
-    if stage.cut is not Cut.BY_TILES:
-        return [unit.name for unit in stage_units(plan, stage)]
     side = plan.config.field.tile_size_px * GROUP_TILES * FIELD_BLOCK
-    rows, columns = -(-plan.info.height // side), -(-plan.info.width // side)
-    return [group_name((row, column)) for row in range(rows) for column in range(columns)]
+    rows, columns = range(-(-plan.info.height // side)), range(-(-plan.info.width // side))
+    tiles = [group_name((row, column)) for row in rows for column in columns]
+    by_tiles = Cut.BY_TILES
+    return {s.name: tiles if s.cut is by_tiles else [unit.name for unit in stage_units(plan, s)] for s in STAGES}
 
 
 def estimated_bytes(plan: Plan) -> int:

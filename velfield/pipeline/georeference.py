@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from schemas.georeference import ControlPoint, ControlPointsRecord, GeoreferenceRecord
-from schemas.job import Job
 from schemas.summary import RunSummary
 from velfield.errors import InputError
 from velfield.pipeline.local import compute_stages
-from velfield.pipeline.plan import Plan
+from velfield.pipeline.plan import Plan, job_of
 from velfield.pipeline.result import StageResult, commit
 from velfield.pipeline.stage import STAGE, STAGES
 from velfield.pipeline.stages.georeference import (
@@ -119,7 +118,11 @@ def georeference(
         compute_stages(plan, ("maps",))
         write_report(plan, _summary(plan))
         exported = "files exported so far are of the place and scale before; export them again"
-        notes = [*_notes(before_m, fitted, changed), *remove_analysis(run.layout), exported]
+        notes = [*remove_analysis(run.layout), exported]
+        if before_m is None or changed > _OTHER_LIMITS:
+            before = "not known" if before_m is None else f"{before_m:.4g} m a pixel"
+            again = f"to track them with {fitted.gsd_m:.4g} m, run the flight again with --gsd-m {fitted.gsd_m:.4g}"
+            notes.insert(0, f"the scale was {before} when vehicles were tracked; {again}")
     return Georeferenced(fitted, record, tuple(notes))
 
 
@@ -143,10 +146,7 @@ def open_finished_run(root: str | Path) -> Run:
 
 def plan_of_finished(run: Run) -> Plan:
     """The plan of a finished run, from its folder alone: its source may be gone."""
-    given = run.record.given
-    if given is None:
-        raise InputError(f"{run.layout.root} has no record of its inputs; run `velfield run` on it again")
-    job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
+    job = job_of(run.layout, run.record)
     return Plan(job, describe_source(run), np.arange(run.frames.count), run.record.inputs, run.record.keys)
 
 
@@ -171,13 +171,3 @@ def _summary(plan: Plan) -> RunSummary:
     found = {stage.name: read_commits(plan.layout, stage.name) for stage in STAGES}
     done = [summarise_stage(name, one, units=len(one), before=one, seconds=0.0) for name, one in found.items()]
     return summarise_run(plan, done)
-
-
-def _notes(before_m: float | None, points: ControlPointsRecord, changed: float) -> list[str]:
-    if before_m is None or changed > _OTHER_LIMITS:
-        before = "not known" if before_m is None else f"{before_m:.4g} m a pixel"
-        return [
-            f"the scale was {before} when vehicles were tracked; to track them with {points.gsd_m:.4g} m, run the "
-            f"flight again with --gsd-m {points.gsd_m:.4g}"
-        ]
-    return []

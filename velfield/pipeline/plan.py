@@ -119,6 +119,19 @@ class Plan:
         return replace(self, keys=keys, lost=(*self.lost, *lost))
 
 
+def job_of(layout: RunLayout, record: FlightRecord) -> Job:
+    """The job that made a run.
+
+    Raises
+    ------
+    InputError
+        The run has no record of its inputs.
+    """
+    if record.given is None:
+        raise InputError(f"{layout.root} has no record of its inputs; run `velfield run` on it again")
+    return Job(root=str(layout.root), inputs=record.given, config=record.config)
+
+
 def check_inputs(job: Job) -> None:
     """Check that all inputs exist, before anything that takes long is started.
 

@@ -1,37 +1,25 @@
-"""The result of a unit of work, and its commit.
-
-Progress within a unit: stages publish their steps, subscribers in the same process show them.
-
-On a worker of a cluster there is no subscriber, and publishing costs nothing; there progress is shown unit by unit.
-"""
+"""The result of a unit of work, its commit, and the progress within it."""
 
 import ctypes
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from schemas.records import CommitRecord
+from velfield.parallel import count_steps
+from velfield.pipeline.plan import Plan
 from velfield.run.commits import code_version, digest_outputs, valid_commit, write_commit
 
-if TYPE_CHECKING:  # the console imports this file before the first line of a run
-    from velfield.pipeline.plan import Plan
-
-Listener = Callable[[str, int], None]
-
-_listeners: list[Listener] = []
 _muted = threading.local()
 
 
 def advance(stage: str, steps: int = 1) -> None:
     """Publish that ``steps`` more steps (frames, mostly) of ``stage`` are done."""
-    if getattr(_muted, "on", False):
-        return
-    for listener in tuple(_listeners):
-        listener(stage, steps)
+    if not getattr(_muted, "on", False):
+        count_steps(steps, stage=stage)
 
 
 @contextmanager
@@ -42,25 +30,6 @@ def without_progress() -> Iterator[None]:
         yield
     finally:
         _muted.on = False
-
-
-@contextmanager
-def subscribe(listener: Listener) -> Iterator[None]:
-    """Call ``listener`` with all progress of this process within the context.
-
-    Examples
-    --------
-    >>> received = []
-    >>> with subscribe(lambda stage, steps: received.append((stage, steps))):
-    ...     advance("detections", 8)
-    >>> received
-    [('detections', 8)]
-    """
-    _listeners.append(listener)
-    try:
-        yield
-    finally:
-        _listeners.remove(listener)
 
 
 @dataclass(frozen=True)
@@ -76,7 +45,7 @@ class StageResult:
     """One line each."""
 
 
-def commit(plan: "Plan", stage: str, unit: str, result: StageResult, *, started: float) -> CommitRecord:
+def commit(plan: Plan, stage: str, unit: str, result: StageResult, *, started: float) -> CommitRecord:
     """Write the record of a finished unit: from now on it is not computed again."""
     record = CommitRecord(
         stage=stage,
@@ -102,6 +71,6 @@ def _return_free_memory() -> None:
         trim(0)
 
 
-def committed(plan: "Plan", stage: str, unit: str) -> CommitRecord | None:
+def committed(plan: Plan, stage: str, unit: str) -> CommitRecord | None:
     """The record of a unit where it is finished as this plan wants it."""
     return valid_commit(plan.layout, stage, unit, plan.keys[stage])

@@ -6,7 +6,7 @@ inputs of `velfield run`, by name: ``base.*``, ``labels.csv`` or ``labels/``, ``
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 from schemas.job import Inputs
@@ -68,13 +68,13 @@ def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
     if source == drop:
         return Inputs(source=str(drop)), None
     beside = {
-        "base": _first(path for path in sorted(drop.glob("base.*")) if path.suffix.lower() in IMAGE_SUFFIXES),
-        "labels": _first(path for path in (drop / "labels.csv", drop / "labels") if path.exists()),
-        "timestamps": _first(path for path in (drop / "timestamps.csv",) if path.exists()),
-        "detector": _first(path for path in (drop / "detector.json",) if path.exists()),
+        "base": [path for path in sorted(drop.glob("base.*")) if path.suffix.lower() in IMAGE_SUFFIXES],
+        "labels": [drop / "labels.csv", drop / "labels"],
+        "timestamps": [drop / "timestamps.csv"],
+        "detector": [drop / "detector.json"],
     }
-    config = drop / "flight.yaml"
-    given = {name: str(path) for name, path in beside.items() if path is not None}
+    found = {name: [str(path) for path in paths if path.exists()] for name, paths in beside.items()}
+    given, config = {name: paths[0] for name, paths in found.items() if paths}, drop / "flight.yaml"
     return Inputs.model_validate({"source": str(source), **given}), config if config.exists() else None
 
 
@@ -85,10 +85,6 @@ def _source_in(drop: Path) -> Path:
     if len(videos) > 1:
         raise InputError(f"{drop}: found {len(videos)} videos; drop one flight at a time")
     return videos[0] if videos else drop
-
-
-def _first(paths: Iterable[Path]) -> Path | None:
-    return next(iter(paths), None)
 
 
 def run_folders(runs: Path, name: str = "") -> list[Path]:
