@@ -113,6 +113,12 @@ def test_where_all_stop_the_delay_is_against_the_pace_at_which_they_come(analysi
     (cut,) = TrafficAnalysis(gather(near)).movements
     assert "N" not in cut.delays_s
     assert "W" in cut.delays_s
+    long = gather([track for track in crossroads() if track[0][0] > 35.0 and track[0][-1] < 165.0])
+    assert "N" in TrafficAnalysis(long).movements[0].delays_s
+    (brief,) = TrafficAnalysis(replace(long, gaps_s=np.array([[40.0, 50.0]]))).movements  # two films, none of 120 s
+    assert brief.timed("N") == 12
+    assert not brief.delays_s
+    assert {m.delay_s for m in brief.movements} == {None}
 
 
 def test_vehicles_too_few_for_a_delay_of_each_turn_give_that_of_their_approach() -> None:

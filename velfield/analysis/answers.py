@@ -19,7 +19,7 @@ from velfield.analysis.approaches import (
 )
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.lanes.junctions import inside_hull
-from velfield.analysis.movements.movements import MIN_DELAYED, JunctionMovements
+from velfield.analysis.movements.movements import MIN_DELAY_S, MIN_DELAYED, JunctionMovements
 from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s, least_green_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import MOVES_M, Trajectories
@@ -243,9 +243,15 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
 
 def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:
     """The delay of each approach of a junction where ways meet; of the others what is missing, in one answer."""
+    seen_s = float(np.diff(analysis.trajectories.observed_s).max())
     if not analysis.ways_meet(found.junction.number):
         return
     subject, delays = f"junction {found.junction.number}", approach_delays(analysis, found)
+    if seen_s < MIN_DELAY_S:
+        yield Answer(
+            "delay", subject, "too little data", f"too little data: {seen_s:.0f} s, {MIN_DELAY_S:.0f} s needed"
+        )
+        return
     for delay in delays:
         yield Answer("delay", f"{subject} from {delay.arm}", "found", f"mean {delay.text}", delay.delay_s, "s")
     unknown = arms_without_delay(found, delays)

@@ -31,6 +31,9 @@ _SLICE_S = 120.0
 """Counts of slices so long show how much the flow varies."""
 MIN_PASSES, MIN_DELAYED, _MIN_FREE = 3, 10, 3
 """Fewest vehicles of a movement; of which the delay is known; and of these that do not stop."""
+MIN_DELAY_S = 120.0
+"""A delay is that of traffic that is seen for so long: in less there are a queue or two, and who waits long in them is
+not seen to leave."""
 _TURN_RAD = np.radians(40)
 """Who changes his direction by less goes straight on."""
 _WAITS_S = 1.5
@@ -400,9 +403,9 @@ def _times(passes: Passes, pace: float | None, turn: Turn, weight: float) -> _Ti
 
 
 def _delay(of: Sequence[_Times], observed_s: FloatArray, spread: tuple[float, int]) -> Estimate | None:
-    """Mean delay of the vehicles of some movements; None of fewer than ten whose delay is known."""
+    """Mean delay of the vehicles of some movements; None of fewer than ten whose delay is known, or seen too short."""
     known = [(t.lost_s, t.whole_s, t.begin_s, t.weight) for t in of if t.lost_s is not None]
-    if sum(len(row[0]) for row in known) < MIN_DELAYED:
+    if sum(len(row[0]) for row in known) < MIN_DELAYED or np.diff(observed_s).max() < MIN_DELAY_S:
         return None
     lost, whole, begin, weight = map(np.concatenate, zip(*known, strict=True))
     delay = _mean_time(lost, whole, begin, observed_s, spread, weight)
