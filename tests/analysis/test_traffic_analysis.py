@@ -1,6 +1,5 @@
 """Answers about constructed traffic: a signal of known cycle, turning counts, free flow, a U-turn, a wrong way."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -609,8 +608,8 @@ def test_pairs_that_errors_leave_in_doubt_are_neither_counted_nor_denied(gap_m: 
     (answer,) = (a for a in find_answers(analysis) if a.topic == "conflicts")
     assert answer.state == state
     assert sum(c.likely for c in analysis.conflicts) == (state == "found")
-    # of one event the interval alone: its middle would be quoted as if it were known
-    assert bool(re.match(r"1 seen, \d+ to \d+ an hour: ", answer.text)) == (state == "found")
+    # the interval of one event is wide, and an end of it would be quoted as if it were known
+    assert answer.text.startswith("1 seen, too few to say how often: ") == (state == "found")
 
 
 def in_two_clips(

@@ -236,7 +236,7 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
         begins_s = streams[0].green_phase_s.value
         first_s = begins_s if first_s is None else first_s
         later_s = (begins_s - first_s) % cycle.value
-        after = f", beginning {later_s:.0f} s after the first" if later_s else ""
+        after = f", beginning {later_s:.0f} s after the first green" if later_s else ""
         text += f"; {_from_arms(analysis, signal.junction, lanes)}green{long}{after}"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
@@ -331,8 +331,8 @@ def _events(topic: str, analysis: TrafficAnalysis, n: int, detail: str = "") -> 
     if n:
         rate = estimate_event_rate(n, hours) if seconds >= _SHORT_S else None
         often = ", too short to say how often"
-        if rate and n < _FEW_EVENTS:  # the middle of so wide an interval would be quoted as if it were known
-            often = f", {rate.low:.0f} to {rate.high:.0f} an hour"
+        if rate and n < _FEW_EVENTS:  # so wide an interval would be quoted by one of its ends
+            often = ", too few to say how often"
         elif rate:
             often = f", {rate.value:.0f} an hour ({rate.low:.0f} to {rate.high:.0f})"
         text = f"{n} seen{often}: {detail}" if detail else f"{n} seen{often}"

@@ -35,14 +35,15 @@ class ApproachDelay:
 
     @property
     def value_text(self) -> str:
-        """The delay alone: ``25 s or more``."""
-        return f"{self.delay_s.value:.0f} s{' or more' if self.partly else ''}"
+        """The delay alone, its lower bound where a part of the wait is out of view: ``25 s``, ``at least 20 s``."""
+        return f"at least {self.delay_s.low:.0f} s" if self.partly else f"{self.delay_s.value:.0f} s"
 
     @property
     def text(self) -> str:
         """The delay, its interval and its level, for people."""
         delay, level = self.delay_s, f", level of service {self.level}" if self.level else ""
-        return f"{self.value_text} ({delay.low:.0f} to {delay.high:.0f}, n {delay.n}){level}"
+        ends = "" if self.partly else f"{delay.low:.0f} to {delay.high:.0f}, "
+        return f"{self.value_text} ({ends}n {delay.n}){level}"
 
 
 def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list[ApproachDelay]:
@@ -77,9 +78,9 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
     >>> east = ApproachDelay("E", Estimate(46, 39, 53, 60), "", (), False)
     >>> west = ApproachDelay("W", Estimate(22, 15, 29, 60), "", (), False)
     >>> compare_delays([east, west])
-    'not by the waiting times: vehicles from E wait 24 s (14 to 34) longer than those from W'
+    'it is not fair by waiting time: vehicles from E wait 24 s (14 to 34) longer than those from W'
     >>> compare_delays([west, west])
-    'as far as is shown: no approach waits longer than another, their mean delays are within 0 s'
+    'it is fair by waiting time, as far as is shown: mean delays are within 0 s of each other'
     >>> compare_delays([west], ["E", "N"])
     'whether it is fair is not known: the delay from E and N is not'
     >>> compare_delays([west, west], ["N"])
@@ -92,16 +93,20 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
     sd_s = [(d.delay_s.high - d.delay_s.low) / (2 * stats.norm.ppf(0.95)) for d in (longest, shortest)]
     reach_s = float(stats.studentized_range.ppf(0.9, len(delays), np.inf)) * hypot(*sd_s) / sqrt(2)
     by_s = longest.delay_s.value - shortest.delay_s.value
-    part = ", as far as is seen" if longest.partly or shortest.partly else ""
     if by_s < reach_s and lacks:
         return f"{lacks}; those from {list_text([d.arm for d in delays])} are within {by_s:.0f} s"
     if by_s < reach_s:
-        alike = f"no approach waits longer than another{part}, their mean delays are within {by_s:.0f} s"
-        return f"as far as is shown: {alike}"
-    least = ", who wait least" if len(delays) > 2 else ""
+        part = ", in view," if longest.partly or shortest.partly else ""
+        return (
+            f"it is fair by waiting time, as far as is shown: mean delays{part} are within {by_s:.0f} s of each other"
+        )
+    least, most = f"{by_s - reach_s:.0f}", f"{by_s + reach_s:.0f}"
+    longer = f"at least {least} s" if longest.partly else f"{by_s:.0f} s ({least} to {most})"
+    least_of_all = ", who wait least" if len(delays) > 2 else ""
     return (
-        f"not by the waiting times: vehicles from {longest.arm} wait {by_s:.0f} s ({by_s - reach_s:.0f} to "
-        f"{by_s + reach_s:.0f}) longer than those from {shortest.arm}{least}{part}"
+        f"it is not fair by waiting time: vehicles from {longest.arm} wait {longer} longer than those from "
+        f"{shortest.arm}{least_of_all}"
+        + (", as far as is seen" if shortest.partly else "")
         + (f"; the delay from {list_text(unknown)} is not known" if unknown else "")
     )
 
@@ -139,10 +144,10 @@ def queue_text(queue: Queue) -> str:
     >>> queue_text(Queue(12.0, Estimate(4, 3, 6, 3), 23.4))
     '4 vehicles (3 to 6), 23 m'
     >>> queue_text(Queue(12.0, Estimate(14, 14, 14, 14), 92.0, reaches_edge=True))
-    'at least 14 vehicles on 92 m; where it ends is not seen'
+    'at least 14 vehicles, 92 m and more: it ends out of view'
     """
     n = queue.vehicles
     if queue.reaches_edge:
-        return f"at least {count_text(n.low, 'vehicle')} on {queue.length_m:.0f} m; where it ends is not seen"
+        return f"at least {count_text(n.low, 'vehicle')}, {queue.length_m:.0f} m and more: it ends out of view"
     ends = f" ({n.low:.0f} to {n.high:.0f})" if n.low < n.high else ""
     return f"{count_text(n.value, 'vehicle')}{ends}, {queue.length_m:.0f} m"

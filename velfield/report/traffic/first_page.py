@@ -129,7 +129,7 @@ def _entered(analysis: TrafficAnalysis, found: JunctionMovements) -> str:
     of = count_text(len(analysis.trajectories), "vehicle")
     return (
         f"junction {found.junction.number}: {sum(by_arm.values()):.0f} of the {of} were seen to enter it, {arms}; the "
-        "others left it, did not reach it or drove elsewhere"
+        "others drove away from it, had not reached it, or passed elsewhere"
     )
 
 
@@ -165,7 +165,9 @@ def _waits(
         )
     for name in dict.fromkeys((*(delay.arm for delay in delays), *by_length)):
         said = [count_text(found.entered(name), "vehicle")]
-        said += [f"mean delay {delay.text}" for delay in delays if delay.arm == name] or ["delay not known"]
+        said += [f"mean delay {delay.text}" for delay in delays if delay.arm == name] or [
+            f"delay not known, with {found.timed(name)} vehicles seen from 60 m before the junction to behind it"
+        ]
         if name in longest:
             said.append(f"longest queue {queue_text(longest[name][1])}")
         yield f"from {name}: " + "; ".join(said)
@@ -178,11 +180,10 @@ def _danger(answers: list[Answer], duration_s: float) -> Iterator[str]:
     if all(topic in seen and seen[topic].at_most_per_h for topic in ("conflicts", "unusual")):
         most = seen.pop("conflicts").at_most_per_h or 0.0
         del seen["unusual"]
-        short = ", too short a time to call the place safe" if most > _SAFE_PER_H else ""
+        short = f". That is too short to call the place safe: even {rate_text(most)} near misses an hour may not show"
         yield (
-            f"nothing dangerous was seen in {duration_text(duration_s)}{short}: no two vehicles came within 1.5 s of "
-            f"meeting each other, and none drove against the traffic; a place with {rate_text(most)} such near misses "
-            "an hour shows none in one of ten films of this length"
+            f"nothing dangerous was seen in {duration_text(duration_s)}: no two vehicles came within 1.5 s of meeting "
+            f"each other, and none drove against the traffic{short if most > _SAFE_PER_H else ''}"
         )
     elif "conflicts" in events and seen and "conflicts" not in seen:
         yield f"near misses: {events['conflicts'].text}"
