@@ -35,31 +35,22 @@ TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on 
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to one question.
-
-    Attributes
-    ----------
-    topic, subject
-        The question (``signal``), and the place or group that it is asked of (``junction 3``; empty: the flight).
-    state
-        ``found``: there is a number, or a list; ``none``: seen to be absent; ``too little data``: ``text`` says what is
-        missing.
-    text
-        The answer in words, with intervals and counts.
-    estimate, unit
-        The number that the answer gives, with its interval; None where it gives several, or none.
-    at_most_per_h
-        Upper bound, for the state ``none``: the rate that is not exceeded with 90 % probability; None in clips of less
-        than a minute.
-    """
+    """The answer to one question."""
 
     topic: str
     subject: str
+    """The question (``signal``), and the place or group that it is asked of (``junction 3``; empty: the flight)."""
     state: State
+    """``found``: there is a number, or a list; ``none``: seen to be absent; ``too little data``: ``text`` says what is
+    missing."""
     text: str
+    """The answer in words, with intervals and counts."""
     estimate: Estimate | None = None
     unit: str = ""
+    """The number that the answer gives, with its interval; None where it gives several, or none."""
     at_most_per_h: float | None = None
+    """Upper bound, for the state ``none``: the rate that is not exceeded with 90 % probability; None in clips of less
+    than a minute."""
 
 
 def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iterator[Answer]:

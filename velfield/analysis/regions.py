@@ -16,19 +16,13 @@ _EIGHT_NEIGHBOURS = np.ones((3, 3), np.int8)
 
 @dataclass(frozen=True)
 class Regions:
-    """Connected regions of a map.
-
-    Attributes
-    ----------
-    labels
-        (h, w) int32 number of the region of each pixel, 0 outside all.
-    table
-        One row a region: ``region`` (its number), ``x_px, y_px`` (its pixel nearest to its centroid), ``area_px``, and
-        medians of layers over its pixels.
-    """
+    """Connected regions of a map."""
 
     labels: NDArray[np.int32]
+    """(h, w) int32 number of the region of each pixel, 0 outside all."""
     table: pd.DataFrame
+    """One row a region: ``region`` (its number), ``x_px, y_px`` (its pixel nearest to its centroid), ``area_px``, and
+    medians of layers over its pixels."""
 
 
 def label_mask(mask: Mask, *, min_area_px: int) -> NDArray[np.int32]:

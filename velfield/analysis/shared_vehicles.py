@@ -25,16 +25,12 @@ _NEARLY_AS_MANY = 0.9
 
 @dataclass(frozen=True)
 class SharedVehicles:
-    """Pairs of tracks of one vehicle.
-
-    Attributes
-    ----------
-    tracks : (n, 2) ids: of the first run, of the second.
-    offset_s : what the second run's clock is ahead of the first one's, s; 0 where no moving vehicles determine it.
-    """
+    """Pairs of tracks of one vehicle."""
 
     tracks: IntArray
+    """(n, 2) ids: of the first run, of the second."""
     offset_s: float
+    """What the second run's clock is ahead of the first one's, s; 0 where no moving vehicles determine it."""
 
     @property
     def count(self) -> int:

@@ -26,18 +26,12 @@ _MAX_LAG = 40
 
 @dataclass(frozen=True)
 class TimeCheck:
-    """Check of the times by the vehicles' accelerations.
-
-    Attributes
-    ----------
-    vehicles
-        How many set off or stop.
-    median_m_per_s2
-        Median of `speed_changes`; NaN of fewer than `MIN_VEHICLES`.
-    """
+    """Check of the times by the vehicles' accelerations."""
 
     vehicles: int
+    """How many set off or stop."""
     median_m_per_s2: float
+    """Median of `speed_changes`; NaN of fewer than `MIN_VEHICLES`."""
 
     @property
     def known(self) -> bool:

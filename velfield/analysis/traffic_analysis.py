@@ -51,17 +51,6 @@ _THREADS = 2
 class TrafficAnalysis:
     """Answers from trajectories of vehicles that move; lengths in metres, times in seconds.
 
-    Attributes
-    ----------
-    slice_s
-        Counts by time are of slices so long.
-    parked
-        (n, 3) position, m, and axial orientation, rad, of parked vehicles; None: not known.
-    classes
-        Class of the vehicle of each trajectory; None: unknown.
-    arm_names
-        How the arms of junctions and of the scene are named.
-
     Examples
     --------
     >>> from velfield.analysis.trajectories import make_trajectories
@@ -73,9 +62,13 @@ class TrafficAnalysis:
 
     trajectories: Trajectories
     slice_s: float = SLICE_S
+    """Counts by time are of slices so long."""
     parked: FloatArray | None = None
+    """(n, 3) position, m, and axial orientation, rad, of parked vehicles; None: not known."""
     classes: VehicleClasses | None = None
+    """Class of the vehicle of each trajectory; None: unknown."""
     arm_names: ArmNames = field(default_factory=ArmNames)
+    """How the arms of junctions and of the scene are named."""
 
     @cached_property
     def samples(self) -> PathSamples:

@@ -37,41 +37,28 @@ _MIN_STEP_M = 0.3
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Tracks as flat arrays: track k has the rows ``first[k]:first[k + 1]``, in time order.
-
-    Attributes
-    ----------
-    track_id
-        (n,) ids of the tracks.
-    first
-        (n + 1,) rows.
-    frame, time_s
-        (m,) frame and time of each position.
-    xy_m, velocity_m_per_s
-        (m, 2) position, and velocity.
-    gsd_m
-        Metres a base pixel.
-    measured_length_m
-        (n,) lengths of the vehicles, NaN where one was not measured; None: none was.
-    position_sd_m
-        Standard deviation of a position along one axis, of errors that last; 0: less than a lane's width matters to.
-    gaps_s
-        (k, 2) begins and ends of longer times without frames, as between clips, in time order; None: there are none.
-    seen_s
-        Times of the first and the last frame; None: not known, those of the first and the last position.
-    """
+    """Tracks as flat arrays: track k has the rows ``first[k]:first[k + 1]``, in time order."""
 
     track_id: IntArray
+    """(n,) ids of the tracks."""
     first: IntArray
+    """(n + 1,) rows."""
     frame: IntArray
     time_s: FloatArray
+    """(m,) frame and time of each position."""
     xy_m: FloatArray
     velocity_m_per_s: FloatArray
+    """(m, 2) position, and velocity."""
     gsd_m: float
+    """Metres a base pixel."""
     measured_length_m: FloatArray | None = None
+    """(n,) lengths of the vehicles, NaN where one was not measured; None: none was."""
     position_sd_m: float = 0.0
+    """Standard deviation of a position along one axis, of errors that last; 0: less than a lane's width matters to."""
     gaps_s: FloatArray | None = None
+    """(k, 2) begins and ends of longer times without frames, as between clips, in time order; None: there are none."""
     seen_s: tuple[float, float] | None = None
+    """Times of the first and the last frame; None: not known, those of the first and the last position."""
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -306,25 +293,17 @@ def _bridge(first: IntArray, time_s: FloatArray, step: FloatArray, known: Mask, 
 
 @dataclass(frozen=True)
 class PathSamples:
-    """Points at equal distances along the paths of tracks.
-
-    Attributes
-    ----------
-    track
-        (k,) number of the track, in its order along the path.
-    xy_m
-        (k, 2) position.
-    direction_rad
-        (k,) direction of travel.
-    time_s, speed_m_per_s
-        (k,) when the vehicle was there, and how fast.
-    """
+    """Points at equal distances along the paths of tracks."""
 
     track: IntArray
+    """(k,) number of the track, in its order along the path."""
     xy_m: FloatArray
+    """(k, 2) position."""
     direction_rad: FloatArray
+    """(k,) direction of travel."""
     time_s: FloatArray
     speed_m_per_s: FloatArray
+    """(k,) when the vehicle was there, and how fast."""
 
     def __len__(self) -> int:
         return len(self.track)

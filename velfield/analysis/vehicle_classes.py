@@ -47,22 +47,15 @@ _DRAWS = 500
 
 @dataclass(frozen=True)
 class VehicleClasses:
-    """Classes of the vehicles of a flight, of which there are k: `COUNTED_CLASSES`.
-
-    Attributes
-    ----------
-    probability
-        (n, k); NaN of vehicles that were not measured.
-    shares
-        (k,) in the flight's traffic.
-    separability
-        (k,) how well the measurements separate each class from the others: a share of n vehicles is known as well
-        as one of this fraction of them whose classes are certain.
-    """
+    """Classes of the vehicles of a flight, of which there are k: `COUNTED_CLASSES`."""
 
     probability: FloatArray
+    """(n, k); NaN of vehicles that were not measured."""
     shares: FloatArray
+    """(k,) in the flight's traffic."""
     separability: FloatArray
+    """(k,) how well the measurements separate each class from the others: a share of n vehicles is known as well as one
+    of this fraction of them whose classes are certain."""
 
     @property
     def measured(self) -> IntArray:

@@ -65,22 +65,18 @@ image; the same for 1000 small frames."""
 
 @dataclass(frozen=True)
 class Measurement:
-    """One method on one flight.
-
-    Attributes
-    ----------
-    corner_px : largest error of a frame's corners, over all frames, base px; of those that were answered.
-    seconds_a_frame : computing time; reading of images is included for velfield, not for stabilo.
-    frames : number of frames in total.
-    """
+    """One method on one flight."""
 
     case: str
     method: str
     seed: int
     score: RegistrationScore
     corner_px: float
+    """Largest error of a frame's corners, over all frames, base px; of those that were answered."""
     seconds_a_frame: float
+    """Computing time; reading of images is included for velfield, not for stabilo."""
     frames: int
+    """Number of frames in total."""
 
     def text(self) -> str:
         """One line of the table."""

@@ -39,23 +39,19 @@ _MAD_TO_SD = 1.4826
 
 @dataclass(frozen=True)
 class StabilityScore:
-    """Stability of stationary corners on the map.
-
-    Attributes
-    ----------
-    points, frames : corners tracked in at least half of the registered frames; number of frames.
-    sd_median_px, sd_p90_px : robust standard deviation of a corner's position per axis, its median and 90th percentile
-        over the corners, base px.
-    drift_px : displacement of the corners' mean position from the first to the last tenth of the frames, base px.
-    noise_px : standard deviation per axis of the typical corner due to image noise of three grey levels alone.
-    """
+    """Stability of stationary corners on the map."""
 
     points: int
     frames: int
+    """Corners tracked in at least half of the registered frames; number of frames."""
     noise_px: float
+    """Standard deviation per axis of the typical corner due to image noise of three grey levels alone."""
     sd_median_px: float
     sd_p90_px: float
+    """Robust standard deviation of a corner's position per axis, its median and 90th percentile over the corners, base
+    px."""
     drift_px: float
+    """Displacement of the corners' mean position from the first to the last tenth of the frames, base px."""
 
     def text(self) -> str:
         """One line."""

@@ -11,21 +11,17 @@ from velfield.camera.straighten import RadialLens
 
 @dataclass(frozen=True)
 class FramePairs:
-    """Matched points of frame pairs, every pair padded to the same length.
-
-    Attributes
-    ----------
-    frame_shape : (height, width), px.
-    frames : (pairs, 2), numbers of the frames i and j.
-    xy_i, xy_j : (pairs, n, 2), raw px.
-    valid : (pairs, n) bool, false where padded.
-    """
+    """Matched points of frame pairs, every pair padded to the same length."""
 
     frame_shape: tuple[int, int]
+    """(height, width), px."""
     frames: IntArray
+    """(pairs, 2), numbers of the frames i and j."""
     xy_i: FloatArray
     xy_j: FloatArray
+    """(pairs, n, 2), raw px."""
     valid: Mask
+    """(pairs, n) bool, false where padded."""
 
     def select(self, pairs: Mask) -> "FramePairs":
         """The pairs of a mask (pairs,)."""
@@ -34,16 +30,12 @@ class FramePairs:
 
 @dataclass(frozen=True)
 class ScaledLens:
-    """Lenses of one profile that differ in amount of distortion and in centre.
-
-    Attributes
-    ----------
-    unit : the lens of amount 1; the amount is in units of Harris' a.
-    centre_sd : prior standard deviation of the centre about that of ``unit``, half-diagonals.
-    """
+    """Lenses of one profile that differ in amount of distortion and in centre."""
 
     unit: RadialLens
+    """The lens of amount 1; the amount is in units of Harris' a."""
     centre_sd: float
+    """Prior standard deviation of the centre about that of ``unit``, half-diagonals."""
 
     def lens(self, shared: FloatArray) -> RadialLens:
         """The lens of (amount, centre x, centre y, ...), the centre in half-diagonals from that of ``unit``."""

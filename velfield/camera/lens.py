@@ -108,17 +108,13 @@ def _move_radially(xy: Points, lens: RadialModel) -> Points:
 
 
 class _Radial:
-    """What the models have in common; each is a frozen dataclass.
-
-    Attributes
-    ----------
-    centre_x_px, centre_y_px : centre of distortion, raw px; a fixed point.
-    half_diagonal_px : unit of the radius, px.
-    """
+    """What the models have in common; each is a frozen dataclass."""
 
     centre_x_px: float
     centre_y_px: float
+    """Centre of distortion, raw px; a fixed point."""
     half_diagonal_px: float
+    """Unit of the radius, px."""
 
     @property
     def radial(self) -> RadialModel:

@@ -26,21 +26,17 @@ _RADII = np.linspace(0.05, 1.0, 40)
 
 @dataclass(frozen=True)
 class MapFit:
-    """A lens fitted to matches with a map.
-
-    Attributes
-    ----------
-    lens : of two terms.
-    change_px : RMS change of undistorted positions over the frame against the lens before, up to a homography.
-    before_px, after_px : median residual under the lens before and under this one, each with its homography, map px.
-    matches : number of matches.
-    """
+    """A lens fitted to matches with a map."""
 
     lens: PolynomialLens
+    """Of two terms."""
     change_px: float
+    """RMS change of undistorted positions over the frame against the lens before, up to a homography."""
     before_px: float
     after_px: float
+    """Median residual under the lens before and under this one, each with its homography, map px."""
     matches: int
+    """Number of matches."""
 
     @property
     def is_better(self) -> bool:

@@ -62,21 +62,17 @@ _HOMOGRAPHY_STEPS = 3
 
 @dataclass(frozen=True)
 class MultiViewFit:
-    """A fit of the lens to frame pairs.
-
-    Attributes
-    ----------
-    amount, amount_sd : of the distortion, in units of Harris' a.
-    fit_px : residual (median over points, mean over pairs) with all parameters fitted; raw px.
-    before_px, after_px : residual of a frame's pairs after homographies alone: with the previous lens, and with the one
-        estimated without that frame (cross-validated).
-    """
+    """A fit of the lens to frame pairs."""
 
     amount: float
     amount_sd: float
+    """Of the distortion, in units of Harris' a."""
     fit_px: float
+    """Residual (median over points, mean over pairs) with all parameters fitted; raw px."""
     before_px: float
     after_px: float
+    """Residual of a frame's pairs after homographies alone: with the previous lens, and with the one estimated without
+    that frame (cross-validated)."""
 
 
 @dataclass(frozen=True)

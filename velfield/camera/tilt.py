@@ -40,16 +40,12 @@ FOCAL_HALF_DIAGONALS = 2.0
 
 @dataclass(frozen=True)
 class Tilt:
-    """Perspective of the ground plane.
-
-    Attributes
-    ----------
-    convergence : (2,) the horizon is where ``1 + convergence @ x = 0``, x in half-diagonals from the image's middle.
-    gain_nats : decrease of the entropy of the lines' angles by its rectification.
-    """
+    """Perspective of the ground plane."""
 
     convergence: tuple[float, float]
+    """(2,) the horizon is where ``1 + convergence @ x = 0``, x in half-diagonals from the image's middle."""
     gain_nats: float
+    """Decrease of the entropy of the lines' angles by its rectification."""
 
     @property
     def degrees(self) -> float:

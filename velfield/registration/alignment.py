@@ -39,21 +39,17 @@ _CONVERGED_PX = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """Patches at corners of the base image.
-
-    Attributes
-    ----------
-    xy : (n, 2) base px, integers.
-    sigma_px : (n,) standard deviation of the position under image noise.
-    fine, coarse : (m, side * side) float32 grey levels about corners, sampled at every and every second pixel.
-    rows : (n,) of each in ``fine`` and ``coarse``: a selection shares these.
-    """
+    """Patches at corners of the base image."""
 
     xy: FloatArray
+    """(n, 2) base px, integers."""
     sigma_px: FloatArray
+    """(n,) standard deviation of the position under image noise."""
     fine: Float32Array
     coarse: Float32Array
+    """(m, side * side) float32 grey levels about corners, sampled at every and every second pixel."""
     rows: IntArray
+    """(n,) of each in ``fine`` and ``coarse``: a selection shares these."""
 
     def __len__(self) -> int:
         return len(self.xy)

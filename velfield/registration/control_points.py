@@ -16,17 +16,13 @@ MIN_SIGMA_PX = 0.01
 
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
-    """Correspondences between a raw frame and the base image.
-
-    Attributes
-    ----------
-    xy_raw, xy_base : (n, 2) px.
-    sigma_px : (n,) expected standard deviation of each; only the ratios matter.
-    """
+    """Correspondences between a raw frame and the base image."""
 
     xy_raw: FloatArray
     xy_base: FloatArray
+    """(n, 2) px."""
     sigma_px: FloatArray
+    """(n,) expected standard deviation of each; only the ratios matter."""
 
     def __len__(self) -> int:
         return len(self.xy_raw)

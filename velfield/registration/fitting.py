@@ -31,18 +31,14 @@ _MAX_ROUNDS = 400
 
 @dataclass(frozen=True, eq=False)
 class CaseDeletionFit:
-    """Result of `fit_by_case_deletion`.
-
-    Attributes
-    ----------
-    transform : the fitted map.
-    inliers : (n,) bool, the control points that were not deleted.
-    rounds : rounds of deletion.
-    """
+    """Result of `fit_by_case_deletion`."""
 
     transform: PolyprojectiveTransform
+    """The fitted map."""
     inliers: Mask
+    """(n,) bool, the control points that were not deleted."""
     rounds: int
+    """Rounds of deletion."""
 
 
 def second_order_monomials(xy: FloatArray, norm: FloatArray) -> FloatArray:

@@ -44,19 +44,15 @@ _MIN_ALIGNED_FRACTION = 0.15
 
 @dataclass(frozen=True, eq=False)
 class BaseReference:
-    """The base image with the features that frames are registered to.
-
-    Attributes
-    ----------
-    shape : (height, width) of the base image, px.
-    templates, dense_templates : patches at its corners; a denser set for another sensor's image.
-    detect : gives its keypoints, detected when they are first asked for.
-    """
+    """The base image with the features that frames are registered to."""
 
     shape: tuple[int, int]
+    """(height, width) of the base image, px."""
     templates: Templates
     dense_templates: Templates
+    """Patches at its corners; a denser set for another sensor's image."""
     detect: Callable[[], Keypoints]
+    """Gives its keypoints, detected when they are first asked for."""
 
     @property
     def keypoints(self) -> Keypoints:
@@ -66,35 +62,31 @@ class BaseReference:
 
 @dataclass(frozen=True, eq=False)
 class FrameRegistration:
-    """One frame's registration and its quality metrics.
-
-    Attributes
-    ----------
-    transform : raw to base pixels; None if it failed.
-    status : ``ok`` or ``failed:<reason with counts>``.
-    n_matches_base, n_matches_previous : control points matched to the base image and to the previous frame; in a frame
-        that optical flow starts, the patches aligned to the base image.
-    n_inliers : inliers of the robust fit.
-    residual_px, heldout_px : RMS residual of the inliers, fitted and cross-validated; NaN if failed.
-    coverage : fraction of the frame's cells with inliers.
-    error_map : (6, 8) RMS cross-validated residual of the inliers per cell, base px; NaN where there are none.
-    position_sd_px : (24, 32) standard deviation of the map by cell, base px; NaN where no control points support it.
-    control_points : the inliers.
-    stiffness : selected for the row shift and for the roll.
-    """
+    """One frame's registration and its quality metrics."""
 
     transform: FrameTransform | None
+    """Raw to base pixels; None if it failed."""
     status: str
+    """``ok`` or ``failed:<reason with counts>``."""
     n_matches_base: int = 0
     n_matches_previous: int = 0
+    """Control points matched to the base image and to the previous frame; in a frame that optical flow starts, the
+    patches aligned to the base image."""
     n_inliers: int = 0
+    """Inliers of the robust fit."""
     residual_px: float = float("nan")
     heldout_px: float = float("nan")
+    """RMS residual of the inliers, fitted and cross-validated; NaN if failed."""
     coverage: float = 0.0
+    """Fraction of the frame's cells with inliers."""
     error_map: FloatArray | None = None
+    """(6, 8) RMS cross-validated residual of the inliers per cell, base px; NaN where there are none."""
     position_sd_px: Float32Array | None = None
+    """(24, 32) standard deviation of the map by cell, base px; NaN where no control points support it."""
     control_points: ControlPoints | None = None
+    """The inliers."""
     stiffness: tuple[float, float] | None = None
+    """Selected for the row shift and for the roll."""
 
     @property
     def ok(self) -> bool:

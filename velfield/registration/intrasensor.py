@@ -151,18 +151,14 @@ class ChainFrame:
 
 @dataclass
 class _PatchHistory:
-    """Patches of the base image that were recently inliers in a chain of frames.
-
-    Attributes
-    ----------
-    templates : those in use.
-    frame : number of the frame in the chain.
-    last_inlier : (n,) number of the frame in which each was an inlier last.
-    """
+    """Patches of the base image that were recently inliers in a chain of frames."""
 
     templates: Templates
+    """Those in use."""
     frame: int
+    """Number of the frame in the chain."""
     last_inlier: IntArray
+    """(n,) number of the frame in which each was an inlier last."""
 
     @classmethod
     def begin(cls, base: BaseReference, first: FrameRegistration) -> "_PatchHistory":

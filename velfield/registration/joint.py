@@ -75,24 +75,20 @@ sum alone is determined (gauge freedom)."""
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Result of `fit_jointly`.
-
-    Attributes
-    ----------
-    transform : the frame's map, without a mesh.
-    weights : (n,) robust weight of each control point, in [0, 1].
-    residuals : (n, 2) base px, observed minus mapped.
-    cv_residuals : (n, 2) the same with the point's fold left out of the fit (cross-validated).
-    scale : robust standard deviation of the residuals per coordinate, over the control points' ``sigma_px``.
-    stiffness : selected for the row shift and for the roll.
-    """
+    """Result of `fit_jointly`."""
 
     transform: FrameTransform
+    """The frame's map, without a mesh."""
     weights: FloatArray
+    """(n,) robust weight of each control point, in [0, 1]."""
     residuals: FloatArray
+    """(n, 2) base px, observed minus mapped."""
     cv_residuals: FloatArray
+    """(n, 2) the same with the point's fold left out of the fit (cross-validated)."""
     scale: float
+    """Robust standard deviation of the residuals per coordinate, over the control points' ``sigma_px``."""
     stiffness: tuple[float, float]
+    """Selected for the row shift and for the roll."""
 
     @property
     def inliers(self) -> Mask:

@@ -26,16 +26,12 @@ _CANDIDATES_PER_KEYPOINT = 3
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints and descriptors.
-
-    Attributes
-    ----------
-    xy : (n, 2) px of the full image, ordered so that the first are the strongest of each cell.
-    descriptors : (n, 128) uint8, SIFT.
-    """
+    """Keypoints and descriptors."""
 
     xy: FloatArray
+    """(n, 2) px of the full image, ordered so that the first are the strongest of each cell."""
     descriptors: ByteArray
+    """(n, 128) uint8, SIFT."""
 
     def __len__(self) -> int:
         return len(self.xy)

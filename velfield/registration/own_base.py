@@ -51,20 +51,16 @@ _MOTION_RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class OwnBase:
-    """The flight's own base image.
-
-    Attributes
-    ----------
-    image : (h, w) uint8, the median.
-    valid : (h, w) bool, covered by enough frames that the median is free of traffic.
-    origin_xy : base pixel (0, 0) on the reference frame's undistorted grid (column, row); integers.
-    frames : number of frames in the median.
-    """
+    """The flight's own base image."""
 
     image: GreyImage
+    """(h, w) uint8, the median."""
     valid: Mask
+    """(h, w) bool, covered by enough frames that the median is free of traffic."""
     origin_xy: tuple[int, int]
+    """Base pixel (0, 0) on the reference frame's undistorted grid (column, row); integers."""
     frames: int
+    """Number of frames in the median."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,16 +57,13 @@ class PolyprojectiveTransform:
     """Second-order rational function with a common denominator, 17 free parameters.
 
     Paper: the polyprojective model. ``x' = a.m / c.m``, ``y' = b.m / c.m`` with ``m = (1, x, y, x^2, xy, y^2)``.
-
-    Attributes
-    ----------
-    coefficients : (3, 6), rows a, b, c; c starts with 1. They act on normalised coordinates.
-    source, target : (3,) each: (cx, cy, s); the normalised coordinate is (x - cx) * s.
     """
 
     coefficients: FloatArray
+    """(3, 6), rows a, b, c; c starts with 1. They act on normalised coordinates."""
     source: FloatArray
     target: FloatArray
+    """(3,) each: (cx, cy, s); the normalised coordinate is (x - cx) * s."""
 
     @classmethod
     def from_homography(cls, matrix: FloatArray, source: FloatArray, target: FloatArray) -> "PolyprojectiveTransform":
@@ -190,25 +187,22 @@ class FrameTransform:
 
     raw -> lens undistortion -> rolling-shutter correction (row spline) -> polyprojective -> plus displacement mesh ->
     base.
-
-    Attributes
-    ----------
-    width, height : size of the raw frame, px.
-    lens : the camera's.
-    polyprojective : undistorted px to base px; a homography has zero second-order terms.
-    row_coefficients : (3, knots), uniform cubic B-spline over the raw rows of the shift in x and y (undistorted px) and
-        the roll about the frame's centre (rad); knots may be 0.
-    mesh : (my, mx, 2) displacement at the cell centres of the raw frame, base px; None is zero displacement.
-    cell_size_px : side of a mesh cell, raw px.
     """
 
     width: int
     height: int
+    """Size of the raw frame, px."""
     lens: Lens
+    """The camera's."""
     polyprojective: PolyprojectiveTransform
+    """Undistorted px to base px; a homography has zero second-order terms."""
     row_coefficients: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))
+    """(3, knots), uniform cubic B-spline over the raw rows of the shift in x and y (undistorted px) and the roll about
+    the frame's centre (rad); knots may be 0."""
     mesh: FloatArray | None = None
+    """(my, mx, 2) displacement at the cell centres of the raw frame, base px; None is zero displacement."""
     cell_size_px: int = 200
+    """Side of a mesh cell, raw px."""
 
     @property
     def centre(self) -> FloatArray:

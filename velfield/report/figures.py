@@ -21,21 +21,14 @@ _COVER = 0.88
 
 @dataclass(frozen=True)
 class MapScale:
-    """Scale and orientation of a map, for its legend.
-
-    Attributes
-    ----------
-    gsd_m
-        Metres a base pixel; None: speeds are shown in px/s and the scale bar in px.
-    unit
-        Unit of speed in the figure.
-    north_rad
-        Direction of north in the image, from +x towards +y (down): -pi/2 where it is up. None: unknown.
-    """
+    """Scale and orientation of a map, for its legend."""
 
     gsd_m: float | None = None
+    """Metres a base pixel; None: speeds are shown in px/s and the scale bar in px."""
     unit: SpeedUnit = "km/h"
+    """Unit of speed in the figure."""
     north_rad: float | None = None
+    """Direction of north in the image, from +x towards +y (down): -pi/2 where it is up. None: unknown."""
 
     @property
     def shown_unit(self) -> SpeedUnit:

@@ -23,24 +23,17 @@ _LETTER_EM = 0.6
 
 @dataclass(frozen=True)
 class Legend:
-    """A legend's content.
-
-    Attributes
-    ----------
-    colours
-        Which scale: a wheel of directions, a bar of speeds from 0 to ``top``, or one of changes from ``-top``.
-    gsd_m
-        Metres a pixel of the map; None: the scale bar is in pixels.
-    north_rad
-        Direction of north in the image; None: unknown.
-    """
+    """A legend's content."""
 
     title: str
     note: str
     colours: Literal["direction", "speed", "change"]
+    """Which scale: a wheel of directions, a bar of speeds from 0 to ``top``, or one of changes from ``-top``."""
     top: float = 1.0
     gsd_m: float | None = None
+    """Metres a pixel of the map; None: the scale bar is in pixels."""
     north_rad: float | None = None
+    """Direction of north in the image; None: unknown."""
 
 
 def legend_panel(map_shape: tuple[int, ...], legend: Legend) -> RGBImage:

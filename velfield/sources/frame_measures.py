@@ -10,18 +10,14 @@ from schemas.arrays import Float32Array, GreyImage
 
 @dataclass(frozen=True)
 class FrameQuality:
-    """Columns of quality beside a frame.
-
-    Attributes
-    ----------
-    sharpness : standard deviation of the Laplacian, grey levels.
-    brightness : mean grey level.
-    thumbnail : (16, 16) float32, the frame scaled down, its mean removed: what `flag_outlier_frames` correlates.
-    """
+    """Columns of quality beside a frame."""
 
     sharpness: float
+    """Standard deviation of the Laplacian, grey levels."""
     brightness: float
+    """Mean grey level."""
     thumbnail: Float32Array
+    """(16, 16) float32, the frame scaled down, its mean removed: what `flag_outlier_frames` correlates."""
 
 
 def frame_quality(grey: GreyImage) -> FrameQuality:

@@ -55,24 +55,20 @@ SourceKind = Literal["video", "folder"]
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """One decoded frame.
-
-    Attributes
-    ----------
-    source_index : its index in `SourceInfo`, in order of time.
-    name : an image's file name, or a video's 0-based frame index, as text: its name in labels.
-    time_s : true time, s: the container's, the CSV's, or index / fps with --fps.
-    grey : (h, w) uint8, raw pixels as stored (no EXIF rotation); zeros where it is unreadable.
-    flags : bits of `velfield.sources.quality.FrameFlag`.
-    reason : the fault, in one line, without the frame's name; empty if there was none.
-    """
+    """One decoded frame."""
 
     source_index: int
+    """Its index in `SourceInfo`, in order of time."""
     name: str
+    """An image's file name, or a video's 0-based frame index, as text: its name in labels."""
     time_s: float
+    """True time, s: the container's, the CSV's, or index / fps with --fps."""
     grey: GreyImage
+    """(h, w) uint8, raw pixels as stored (no EXIF rotation); zeros where it is unreadable."""
     flags: int
+    """Bits of `velfield.sources.quality.FrameFlag`."""
     reason: str = ""
+    """The fault, in one line, without the frame's name; empty if there was none."""
 
 
 class FootageLoss(str):
@@ -83,43 +79,39 @@ class FootageLoss(str):
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """Properties of a video or an image folder that are known before any frame is decoded.
-
-    Attributes
-    ----------
-    kind : ``video`` or ``folder``.
-    width, height : size of every frame, px.
-    frame_count : number of frames that can be read.
-    times_s : (n,) float64, ascending, s; it may hold equal times, of which `select_frames` takes the first.
-    names : (n,) name of each frame in labels: file names, or indices as text.
-    warnings : one line each, for the user: frames missing, out of order, or truncated; what is lost is a `FootageLoss`.
-    declared_count : number of frames that the container declares, if it does.
-    pts : (n,) int64 presentation time stamps of a video's frames in `time_base` units; empty for a folder and for a
-        video without times. With the file, a frame's identity.
-    key_frames : (n,) bool, key frames, where corruption ends; empty as `pts`.
-    entries : (n,) bool, key frames of closed groups of pictures, where decoding can start.
-    fps : frame rate behind the times, where the user gave one and the source had none.
-    max_pixels : limit on the size of an image, refused before memory is taken.
-    levels : levels of frames of more than 8 bits that become 0 and 255 in every frame.
-    parts : parts of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the
-        start of the first.
-    """
+    """Properties of a video or an image folder that are known before any frame is decoded."""
 
     kind: SourceKind
+    """``video`` or ``folder``."""
     width: int
     height: int
+    """Size of every frame, px."""
     frame_count: int
+    """Number of frames that can be read."""
     times_s: FloatArray
+    """(n,) float64, ascending, s; it may hold equal times, of which `select_frames` takes the first."""
     names: tuple[str, ...]
+    """(n,) name of each frame in labels: file names, or indices as text."""
     warnings: tuple[str, ...] = ()
+    """One line each, for the user: frames missing, out of order, or truncated; what is lost is a `FootageLoss`."""
     declared_count: int | None = None
+    """Number of frames that the container declares, if it does."""
     pts: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(n,) int64 presentation time stamps of a video's frames in `time_base` units; empty for a folder and for a video
+    without times. With the file, a frame's identity."""
     key_frames: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
+    """(n,) bool, key frames, where corruption ends; empty as `pts`."""
     entries: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
+    """(n,) bool, key frames of closed groups of pictures, where decoding can start."""
     fps: float | None = None
+    """Frame rate behind the times, where the user gave one and the source had none."""
     max_pixels: int = 400_000_000
+    """Limit on the size of an image, refused before memory is taken."""
     levels: tuple[float, float] | None = None
+    """Levels of frames of more than 8 bits that become 0 and 255 in every frame."""
     parts: tuple[tuple[str, "SourceInfo", float], ...] = ()
+    """Parts of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the start
+    of the first."""
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -31,24 +31,20 @@ MAX_GSD_DISAGREEMENT = 0.02
 
 @dataclass(frozen=True)
 class BaseRaster:
-    """The base image's pixels and georeference.
-
-    Attributes
-    ----------
-    grey : (h, w) uint8: the base image; its pixels are base pixels.
-    valid : (h, w) bool, False where there is no data; None where all pixels have some.
-    crs_wkt, affine, gsd_m : reference system; (a, b, c, d, e, f) from (column, row) of pixel corners to its
-        coordinates, as rasterio's `Affine`; metres a pixel by the reference system's local scale at the centre. None
-        without a reference system; of a local one, which has metres but no place on Earth, only ``gsd_m`` is known.
-    notes : notes on what was changed or is not used, one line each.
-    """
+    """The base image's pixels and georeference."""
 
     grey: GreyImage
+    """(h, w) uint8: the base image; its pixels are base pixels."""
     crs_wkt: str | None = None
     affine: tuple[float, float, float, float, float, float] | None = None
     gsd_m: float | None = None
+    """Reference system; (a, b, c, d, e, f) from (column, row) of pixel corners to its coordinates, as rasterio's
+    `Affine`; metres a pixel by the reference system's local scale at the centre. None without a reference system; of a
+    local one, which has metres but no place on Earth, only ``gsd_m`` is known."""
     valid: Mask | None = None
+    """(h, w) bool, False where there is no data; None where all pixels have some."""
     notes: tuple[str, ...] = ()
+    """Notes on what was changed or is not used, one line each."""
 
 
 def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:

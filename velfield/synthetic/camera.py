@@ -68,39 +68,35 @@ def shake_waves(camera: CameraSimulation, rng: np.random.Generator) -> Waves:
 
 @dataclass(frozen=True)
 class Camera:
-    """The camera of one flight.
-
-    Attributes
-    ----------
-    width, height : frame size, px.
-    focal_px : focal length, px.
-    lens_a, lens_x_px, lens_y_px : Harris' distortion and its centre; radius in half-diagonals.
-    mean_tilt_rad : mean tilt from the vertical, about x.
-    lens_terms : (terms,) coefficients of the polynomial model in place of ``lens_a``; none: Harris' model.
-    position_px : (3,) mean position of the camera, base px; z negative (above the ground).
-    heading_rad : mean rotation about the vertical, from +x towards +y.
-    motion : waves of x, y, z (base px), rotation about z, tilt about x, tilt about y (rad).
-    shake : waves of the image's vibration in x and y, undistorted px.
-    readout_s : time from the first row to the last.
-    times_s : (frames,) exposure time of each frame's first row.
-    relief : height of the ground.
-    """
+    """The camera of one flight."""
 
     width: int
     height: int
+    """Frame size, px."""
     focal_px: float
+    """Focal length, px."""
     lens_a: float
     lens_x_px: float
     lens_y_px: float
+    """Harris' distortion and its centre; radius in half-diagonals."""
     position_px: FloatArray
+    """(3,) mean position of the camera, base px; z negative (above the ground)."""
     heading_rad: float
+    """Mean rotation about the vertical, from +x towards +y."""
     motion: Waves
+    """Waves of x, y, z (base px), rotation about z, tilt about x, tilt about y (rad)."""
     shake: Waves
+    """Waves of the image's vibration in x and y, undistorted px."""
     readout_s: float
+    """Time from the first row to the last."""
     times_s: FloatArray
+    """(frames,) exposure time of each frame's first row."""
     relief: Relief
+    """Height of the ground."""
     mean_tilt_rad: float = 0.0
+    """Mean tilt from the vertical, about x."""
     lens_terms: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(terms,) coefficients of the polynomial model in place of ``lens_a``; none: Harris' model."""
 
     @property
     def half_diagonal_px(self) -> float:

@@ -21,22 +21,17 @@ _MAX_INTERVAL_S = 0.45
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of the pipeline; the defaults were measured on rendered simulated flights.
-
-    Attributes
-    ----------
-    recall : probability that a vehicle is detected, independently in each frame.
-    position_sd_px : standard deviation of a detection's position along one axis, base px.
-    displacement_sd_px, claimed_sd_px : standard deviation of an aligned link's displacement along one axis, and the one
-        that the alignment reports.
-    unaligned_fraction : fraction of links whose crops do not align, with the displacement of the detections.
-    """
+    """Errors of the pipeline; the defaults were measured on rendered simulated flights."""
 
     recall: float = 0.97
+    """Probability that a vehicle is detected, independently in each frame."""
     position_sd_px: float = 0.8
+    """Standard deviation of a detection's position along one axis, base px."""
     displacement_sd_px: float = 0.09
     claimed_sd_px: float = 0.13
+    """Standard deviation of an aligned link's displacement along one axis, and the one that the alignment reports."""
     unaligned_fraction: float = 0.05
+    """Fraction of links whose crops do not align, with the displacement of the detections."""
 
 
 NO_ERRORS = Errors(recall=1.0, position_sd_px=0.0, displacement_sd_px=0.0, claimed_sd_px=0.0, unaligned_fraction=0.0)

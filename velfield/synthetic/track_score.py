@@ -27,30 +27,25 @@ _KEPT_MATCH = 1000.0
 
 @dataclass(frozen=True)
 class TrackScore:
-    """Scores of the tracks of a flight.
-
-    Attributes
-    ----------
-    idf1, id_precision, id_recall : identity metrics.
-    mota : multiple object tracking accuracy.
-    switches, misses, false_positives : counts: of vehicles that change their track, of positions of vehicles without
-        one of a track, and the other way.
-    positions : number of true positions.
-    tracks_per_vehicle : mean number of tracks of a vehicle, each track being that of the vehicle that it is matched to
-        most.
-    mixed_tracks : fraction of the tracks that are matched to two vehicles or more, in two frames or more each.
-    """
+    """Scores of the tracks of a flight."""
 
     idf1: float
     id_precision: float
     id_recall: float
+    """Identity metrics."""
     mota: float
+    """Multiple object tracking accuracy."""
     switches: int
     misses: int
     false_positives: int
+    """Counts: of vehicles that change their track, of positions of vehicles without one of a track, and the other
+    way."""
     positions: int
+    """Number of true positions."""
     tracks_per_vehicle: float
+    """Mean number of tracks of a vehicle, each track being that of the vehicle that it is matched to most."""
     mixed_tracks: float
+    """Fraction of the tracks that are matched to two vehicles or more, in two frames or more each."""
 
 
 def score_run_tracks(
@@ -88,22 +83,18 @@ def score_run_tracks(
 
 @dataclass(frozen=True)
 class FrameObjects:
-    """Vehicles and track positions of one frame.
-
-    Attributes
-    ----------
-    vehicle, vehicle_xy, counts : (n,) ids, (n, 2) px, and (n,) whether the vehicle counts; the others are ignored.
-    direction_rad, length_px : (n,) axes and lengths of the vehicles.
-    track, track_xy : (m,) ids and (m, 2) px.
-    """
+    """Vehicles and track positions of one frame."""
 
     vehicle: IntArray
     vehicle_xy: FloatArray
     counts: Mask
+    """(n,) ids, (n, 2) px, and (n,) whether the vehicle counts; the others are ignored."""
     direction_rad: FloatArray
     length_px: FloatArray
+    """(n,) axes and lengths of the vehicles."""
     track: IntArray
     track_xy: FloatArray
+    """(m,) ids and (m, 2) px."""
 
 
 def score_tracks(frames: Iterator[FrameObjects], *, match_px: float) -> TrackScore:

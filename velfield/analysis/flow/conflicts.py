@@ -53,18 +53,7 @@ _CAME_M = 3
 
 @dataclass(frozen=True)
 class Conflict:
-    """Two vehicles that were near in time: ``first`` and ``second`` by number of their tracks.
-
-    Attributes
-    ----------
-    value_s, sd_s
-        Post-encroachment time (crossing, merging), or least time to collision (following), and its standard deviation.
-    probability
-        That it is below ``threshold_s``, and of crossing that the roads are on one level; of following, and that the
-        follower must brake harder than `HARD_BRAKING_M_PER_S2` not to collide, and is behind, not beside.
-    one_level
-        Probability that the roads are on one level.
-    """
+    """Two vehicles that were near in time: ``first`` and ``second`` by number of their tracks."""
 
     kind: ConflictKind
     first: int
@@ -73,9 +62,14 @@ class Conflict:
     xy_m: FloatArray
     value_s: float
     sd_s: float
+    """Post-encroachment time (crossing, merging), or least time to collision (following), and its standard
+    deviation."""
     threshold_s: float
     probability: float
+    """That it is below ``threshold_s``, and of crossing that the roads are on one level; of following, and that the
+    follower must brake harder than `HARD_BRAKING_M_PER_S2` not to collide, and is behind, not beside."""
     one_level: float = 1.0
+    """Probability that the roads are on one level."""
 
     @property
     def on_one_level(self) -> bool:

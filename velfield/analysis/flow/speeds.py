@@ -88,22 +88,15 @@ def _speeds_by_station(samples: LaneSamples, station: IntArray, count: int) -> l
 
 @dataclass(frozen=True)
 class FreeFlow:
-    """Free flow on a road: lanes beside each other and one after the other.
-
-    Attributes
-    ----------
-    lanes
-        Lanes of the road.
-    speed_m_per_s
-        Median speed at which drivers go where nobody is ahead; None: too few of them are seen to. Those who follow
-        count as faster than they go (Botma's estimator of free speeds).
-    p85_m_per_s
-        Which 85 of 100 drivers do not exceed.
-    """
+    """Free flow on a road: lanes beside each other and one after the other."""
 
     lanes: tuple[int, ...]
+    """Lanes of the road."""
     speed_m_per_s: Estimate | None
+    """Median speed at which drivers go where nobody is ahead; None: too few of them are seen to. Those who follow count
+    as faster than they go (Botma's estimator of free speeds)."""
     p85_m_per_s: Estimate | None
+    """Which 85 of 100 drivers do not exceed."""
 
     def limits(self, unit: SpeedUnit = "km/h") -> list[float]:
         """Speeds on signs (`SIGNS`), in km/h or mph, of which one is nearest to the free speed."""

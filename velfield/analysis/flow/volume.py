@@ -34,24 +34,17 @@ LOS_YIELD_S = (10.0, 15.0, 25.0, 35.0, 50.0)
 
 @dataclass(frozen=True)
 class LaneFlow:
-    """Traffic of a lane.
-
-    Attributes
-    ----------
-    flow_veh_per_h
-        At the middle of the lane.
-    density_veh_per_km, space_mean_speed_m_per_s
-        Time spent on the lane over its length and the time; distance driven over time spent (Edie).
-    headway_s, gap_s
-        Mean headway; median time gap of those that follow, rear bumper to front bumper.
-    """
+    """Traffic of a lane."""
 
     lane: int
     flow_veh_per_h: Estimate | None
+    """At the middle of the lane."""
     density_veh_per_km: Estimate | None
     space_mean_speed_m_per_s: Estimate | None
+    """Time spent on the lane over its length and the time; distance driven over time spent (Edie)."""
     headway_s: Estimate | None
     gap_s: Estimate | None
+    """Mean headway; median time gap of those that follow, rear bumper to front bumper."""
 
 
 @dataclass(frozen=True)

@@ -33,21 +33,14 @@ class Links:
 
 @dataclass(frozen=True)
 class Chains:
-    """Lanes as chains of nodes and their connections.
-
-    Attributes
-    ----------
-    nodes
-        Numbers of the nodes of each lane, in the direction of travel.
-    links
-        (start lane, end lane, tracks) of each connection.
-    changes
-        (lane, lane, tracks) of changes from lane to lane.
-    """
+    """Lanes as chains of nodes and their connections."""
 
     nodes: list[IntArray]
+    """Numbers of the nodes of each lane, in the direction of travel."""
     links: list[tuple[int, int, int]]
+    """(start lane, end lane, tracks) of each connection."""
     changes: list[tuple[int, int, int]]
+    """(lane, lane, tracks) of changes from lane to lane."""
 
 
 def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:

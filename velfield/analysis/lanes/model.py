@@ -12,30 +12,21 @@ from schemas.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane between two places where lanes meet or part.
-
-    Attributes
-    ----------
-    number
-        Number of the lane in its graph.
-    xy_m
-        (n, 2) centre line in the direction of travel; it begins where its strongest predecessor ends.
-    tracks
-        Number of tracks that drove on it.
-    width_m, width_source
-        Distance to the neighbouring lane of the same direction; without one, the spread of the paths across it and a
-        car's width.
-    left, right
-        Neighbouring lanes of the same direction, None: none there.
-    """
+    """A lane between two places where lanes meet or part."""
 
     number: int
+    """Number of the lane in its graph."""
     xy_m: FloatArray
+    """(n, 2) centre line in the direction of travel; it begins where its strongest predecessor ends."""
     tracks: int
+    """Number of tracks that drove on it."""
     width_m: float
     width_source: WidthSource
+    """Distance to the neighbouring lane of the same direction; without one, the spread of the paths across it and a
+    car's width."""
     left: int | None = None
     right: int | None = None
+    """Neighbouring lanes of the same direction, None: none there."""
 
     @cached_property
     def along_m(self) -> FloatArray:
@@ -71,49 +62,34 @@ class Connection:
 
 @dataclass(frozen=True)
 class Junction:
-    """Where lanes cross, merge or diverge.
-
-    Attributes
-    ----------
-    number, kind
-        Number of the junction in its graph; its kind.
-    centre_m
-        (2,).
-    hull_m
-        (n, 2) corners of the convex area in which the lanes meet.
-    lanes_in, lanes_out, lanes_inside
-        Numbers of the lanes that reach it, that leave it, and that lie in it.
-    """
+    """Where lanes cross, merge or diverge."""
 
     number: int
     kind: JunctionKind
+    """Number of the junction in its graph; its kind."""
     centre_m: FloatArray
+    """(2,)."""
     hull_m: FloatArray
+    """(n, 2) corners of the convex area in which the lanes meet."""
     lanes_in: tuple[int, ...]
     lanes_out: tuple[int, ...]
     lanes_inside: tuple[int, ...]
+    """Numbers of the lanes that reach it, that leave it, and that lie in it."""
 
 
 @dataclass(frozen=True)
 class LaneSamples:
-    """Samples of tracks on lanes, in the order of each track's path.
-
-    Attributes
-    ----------
-    track, lane
-        (k,) numbers of the track and of the lane.
-    along_m, offset_m
-        (k,) distance along the lane, and to the right of its centre line.
-    time_s, speed_m_per_s
-        (k,) when, and how fast.
-    """
+    """Samples of tracks on lanes, in the order of each track's path."""
 
     track: IntArray
     lane: IntArray
+    """(k,) numbers of the track and of the lane."""
     along_m: FloatArray
     offset_m: FloatArray
+    """(k,) distance along the lane, and to the right of its centre line."""
     time_s: FloatArray
     speed_m_per_s: FloatArray
+    """(k,) when, and how fast."""
 
     def __len__(self) -> int:
         return len(self.track)

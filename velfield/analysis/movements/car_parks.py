@@ -28,30 +28,21 @@ _STOP_S = 3.0
 
 @dataclass(frozen=True)
 class CarPark:
-    """An area with parked vehicles.
-
-    Attributes
-    ----------
-    hull_m
-        (n, 2) its corners.
-    parked
-        Parked vehicles in it.
-    entered, through
-        Vehicles seen to drive in, and of these the ones seen to leave again without a stop.
-    through_share, through_veh_per_h, time_s
-        Their share of those that enter; vehicles an hour; time that they spend inside.
-    tracks
-        Numbers of their tracks.
-    """
+    """An area with parked vehicles."""
 
     hull_m: FloatArray
+    """(n, 2) its corners."""
     parked: int
+    """Parked vehicles in it."""
     entered: int
     through: int
+    """Vehicles seen to drive in, and of these the ones seen to leave again without a stop."""
     through_share: Estimate | None
     through_veh_per_h: Estimate | None
     time_s: Estimate | None
+    """Their share of those that enter; vehicles an hour; time that they spend inside."""
     tracks: IntArray
+    """Numbers of their tracks."""
 
 
 def find_car_parks(

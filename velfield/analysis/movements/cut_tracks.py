@@ -20,28 +20,19 @@ _ACROSS_M = 1.5
 
 @dataclass(frozen=True)
 class CutTracks:
-    """Tracks joined into vehicles.
-
-    Attributes
-    ----------
-    vehicle
-        (tracks,) number of each track's vehicle.
-    trajectories
-        Trajectories of the vehicles, with gaps filled.
-    first
-        (vehicles + 1,) rows of ``track`` and ``start_s``.
-    track, start_s
-        (tracks,) tracks of the vehicles in the order of time, and when each begins.
-    gap_start_s
-        (tracks,) when the gap before each begins, NaN for a vehicle's first track.
-    """
+    """Tracks joined into vehicles."""
 
     vehicle: IntArray
+    """(tracks,) number of each track's vehicle."""
     trajectories: Trajectories
+    """Trajectories of the vehicles, with gaps filled."""
     first: IntArray
+    """(vehicles + 1,) rows of ``track`` and ``start_s``."""
     track: IntArray
     start_s: FloatArray
+    """(tracks,) tracks of the vehicles in the order of time, and when each begins."""
     gap_start_s: FloatArray
+    """(tracks,) when the gap before each begins, NaN for a vehicle's first track."""
 
     @cached_property
     def samples(self) -> PathSamples:

@@ -52,19 +52,13 @@ class Arm:
 
 @dataclass(frozen=True)
 class ArmNames:
-    """How arms are named: by the compass, or by sides of the image (N: its top) where north is not known.
-
-    Attributes
-    ----------
-    north_rad
-        Direction of north in the image, from x towards y (down); None: not known.
-    given
-        The user's names by these ones: ``{"3.W": "Mill Road"}`` of an arm of junction 3, ``{"W": "Mill Road"}`` of a
-        road by which vehicles enter or leave the scene.
-    """
+    """How arms are named: by the compass, or by sides of the image (N: its top) where north is not known."""
 
     north_rad: float | None = None
+    """Direction of north in the image, from x towards y (down); None: not known."""
     given: Mapping[str, str] = field(default_factory=dict)
+    """The user's names by these ones: ``{"3.W": "Mill Road"}`` of an arm of junction 3, ``{"W": "Mill Road"}`` of a
+    road by which vehicles enter or leave the scene."""
 
     @property
     def legend(self) -> str:

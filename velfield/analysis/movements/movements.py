@@ -84,22 +84,7 @@ class Passes:
 
 @dataclass(frozen=True)
 class Movement:
-    """From one arm of a junction to another.
-
-    Attributes
-    ----------
-    seen, inferred
-        Vehicles seen from entry to exit by one track, and those inferred from tracks that are cut.
-    share
-        Fraction of the vehicles that enter by the arm.
-    flow_veh_per_h
-        Vehicles an hour.
-    travel_time_s
-        From 60 m before the junction to its exit.
-    delay_s
-        What that is longer than for vehicles that pass freely, and what they need longer for up to 90 m before, as far
-        as they are seen.
-    """
+    """From one arm of a junction to another."""
 
     junction: int
     arm_in: str
@@ -107,10 +92,16 @@ class Movement:
     turn: Turn
     seen: int
     inferred: float
+    """Vehicles seen from entry to exit by one track, and those inferred from tracks that are cut."""
     share: Estimate | None
+    """Fraction of the vehicles that enter by the arm."""
     flow_veh_per_h: Estimate | None
+    """Vehicles an hour."""
     travel_time_s: Estimate | None
+    """From 60 m before the junction to its exit."""
     delay_s: Estimate | None
+    """What that is longer than for vehicles that pass freely, and what they need longer for up to 90 m before, as far
+    as they are seen."""
     line_m: FloatArray
 
 

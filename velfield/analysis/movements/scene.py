@@ -45,57 +45,40 @@ _YARD_M_PER_S = 6.0
 
 @dataclass(frozen=True)
 class Trips:
-    """Vehicles that entered the scene while it was filmed, one row each.
-
-    Attributes
-    ----------
-    track, origin
-        Numbers of the track that enters, and of the arm.
-    entry_s, exit_s
-        When the vehicle's track begins at the entry, and ends at the exit; NaN: it ends elsewhere.
-    destination
-        (n, arms) probability of each destination: 1 where the vehicle was seen to leave.
-    seen
-        From entry to exit, by one track.
-    elsewhere
-        Seen to leave the picture, by no arm: by a road that fewer than three vehicles took.
-    remains
-        Not seen to leave, but still in the picture at the end; of the others that are not ``seen``, the track is cut.
-    """
+    """Vehicles that entered the scene while it was filmed, one row each."""
 
     track: IntArray
     origin: IntArray
+    """Numbers of the track that enters, and of the arm."""
     entry_s: FloatArray
     exit_s: FloatArray
+    """When the vehicle's track begins at the entry, and ends at the exit; NaN: it ends elsewhere."""
     destination: FloatArray
+    """(n, arms) probability of each destination: 1 where the vehicle was seen to leave."""
     seen: Mask
+    """From entry to exit, by one track."""
     elsewhere: Mask
+    """Seen to leave the picture, by no arm: by a road that fewer than three vehicles took."""
     remains: Mask
+    """Not seen to leave, but still in the picture at the end; of the others that are not ``seen``, the track is cut."""
 
 
 @dataclass(frozen=True)
 class Relation:
-    """Vehicles from one arm of the scene to another.
-
-    Attributes
-    ----------
-    seen, cut, remaining
-        Vehicles seen from entry to exit; those whose track is cut, joined or inferred; and inferred of those still in
-        the picture at the end.
-    share
-        Fraction of the vehicles that enter by the arm.
-    travel_time_s
-        Median travel time of the observed vehicles, s.
-    """
+    """Vehicles from one arm of the scene to another."""
 
     origin: Arm
     destination: Arm
     seen: int
     cut: float
     remaining: float
+    """Vehicles seen from entry to exit; those whose track is cut, joined or inferred; and inferred of those still in
+    the picture at the end."""
     share: Estimate | None
+    """Fraction of the vehicles that enter by the arm."""
     flow_veh_per_h: Estimate | None
     travel_time_s: Estimate | None
+    """Median travel time of the observed vehicles, s."""
 
     @property
     def vehicles(self) -> float:
@@ -105,26 +88,18 @@ class Relation:
 
 @dataclass(frozen=True)
 class OriginDestination:
-    """Origins and destinations of a scene.
-
-    Attributes
-    ----------
-    arms, gates
-        Where roads leave the scene, and their lanes.
-    trips
-        Vehicles that entered while it was filmed.
-    before, unknown
-        Tracks of vehicles that were there in the first frame, and those that began inside later: cut ones, mostly.
-    observed_s
-        (k, 2) begins and ends of the times that are seen.
-    """
+    """Origins and destinations of a scene."""
 
     arms: tuple[Arm, ...]
     gates: tuple[Gate, ...]
+    """Where roads leave the scene, and their lanes."""
     trips: Trips
+    """Vehicles that entered while it was filmed."""
     before: int
     unknown: int
+    """Tracks of vehicles that were there in the first frame, and those that began inside later: cut ones, mostly."""
     observed_s: FloatArray
+    """(k, 2) begins and ends of the times that are seen."""
 
     @cached_property
     def relations(self) -> tuple[Relation, ...]:

@@ -56,46 +56,32 @@ _RED_SD_S = 0.45
 
 @dataclass(frozen=True)
 class StreamSignal:
-    """The signal of one stream.
-
-    Attributes
-    ----------
-    green_phase_s, red_phase_s
-        Onsets of green and of red after the start of a cycle, s.
-    green_s
-        Onsets of green in the flight, one a cycle.
-    start_up_lost_s, saturation_veh_per_h
-        Time that a queue's first four vehicles lose, and flow of those behind them.
-    """
+    """The signal of one stream."""
 
     stream: Stream
     green_phase_s: Estimate
     red_phase_s: Estimate | None
+    """Onsets of green and of red after the start of a cycle, s."""
     green_s: FloatArray
+    """Onsets of green in the flight, one a cycle."""
     start_up_lost_s: Estimate | None
     saturation_veh_per_h: Estimate | None
+    """Time that a queue's first four vehicles lose, and flow of those behind them."""
 
 
 @dataclass(frozen=True)
 class JunctionSignal:
-    """Whether a junction has a signal, and its cycle.
-
-    Attributes
-    ----------
-    signalised
-        None: too little data.
-    reason
-        Why there is none, or why it is not known.
-    phases
-        Lanes whose green begins together, in the order of the cycle.
-    """
+    """Whether a junction has a signal, and its cycle."""
 
     junction: int
     signalised: bool | None
+    """None: too little data."""
     reason: str
+    """Why there is none, or why it is not known."""
     cycle_s: Estimate | None
     streams: tuple[StreamSignal, ...]
     phases: tuple[tuple[int, ...], ...]
+    """Lanes whose green begins together, in the order of the cycle."""
 
 
 def find_signal(
@@ -343,25 +329,18 @@ def stopping_share(stream: Stream) -> Estimate | None:
 
 @dataclass(frozen=True)
 class Queue:
-    """The queue of a stream at a time.
-
-    Attributes
-    ----------
-    vehicles
-        Vehicles that stand, with those for which there is a place between others: a tree hides them, or they were
-        missed. ``n`` is the number of those that are seen; the interval begins with those that are sure to stand at the
-        time, and ends with those that may, with as many others between them as there is room for, and with those that
-        are hidden behind the last one: vehicles are as often as between others.
-    length_m
-        From the stop line to the last one's rear.
-    reaches_edge
-        It ends where the approach comes into view, or `REACH_M` before the line: number and length are lower bounds.
-    """
+    """The queue of a stream at a time."""
 
     time_s: float
     vehicles: Estimate
+    """Vehicles that stand, with those for which there is a place between others: a tree hides them, or they were
+    missed. ``n`` is the number of those that are seen; the interval begins with those that are sure to stand at the
+    time, and ends with those that may, with as many others between them as there is room for, and with those that are
+    hidden behind the last one: vehicles are as often as between others."""
     length_m: float
+    """From the stop line to the last one's rear."""
     reaches_edge: bool = False
+    """It ends where the approach comes into view, or `REACH_M` before the line: number and length are lower bounds."""
 
 
 def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:

@@ -103,19 +103,14 @@ def _hysteresis(speed: FloatArray, owner: IntArray) -> Mask:
 
 @dataclass(frozen=True)
 class Approach:
-    """The lanes of one direction that lead into a junction, one stream each.
-
-    Attributes
-    ----------
-    lane
-        Number of the lane that crosses the junction's border.
-    path_m
-        (n, 2) course upstream of the border and through it, 1 m apart; ``border_m`` is the border's distance along it.
-    """
+    """The lanes of one direction that lead into a junction, one stream each."""
 
     junction: int
     lane: int
+    """Number of the lane that crosses the junction's border."""
     path_m: FloatArray
+    """(n, 2) course upstream of the border and through it, 1 m apart; ``border_m`` is the border's distance along
+    it."""
     border_m: float
 
 

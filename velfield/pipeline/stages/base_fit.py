@@ -19,24 +19,20 @@ _GRID_SIDE = 25
 
 @dataclass(frozen=True)
 class BaseFit:
-    """Registration of the flight to the given base image.
-
-    Attributes
-    ----------
-    direct : whether frames are registered directly to it, not via the flight's own base image.
-    error_px : cross-validated error of the control points, base px.
-    points : number of control points.
-    scale, rotation_rad : base px per frame px at the centre of a frame in the middle of the flight, and the rotation
-        there, from +x towards +y.
-    covered : fraction of the area seen by the flight that the base image covers.
-    """
+    """Registration of the flight to the given base image."""
 
     direct: bool
+    """Whether frames are registered directly to it, not via the flight's own base image."""
     error_px: float
+    """Cross-validated error of the control points, base px."""
     points: int
+    """Number of control points."""
     scale: float
     rotation_rad: float
+    """Base px per frame px at the centre of a frame in the middle of the flight, and the rotation there, from +x
+    towards +y."""
     covered: float
+    """Fraction of the area seen by the flight that the base image covers."""
 
     def note(self) -> str:
         """The registration in one line."""

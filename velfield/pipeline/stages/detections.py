@@ -74,19 +74,14 @@ ID_STEP = 1 << 20
 
 @dataclass(frozen=True)
 class Cars:
-    """Cars of a block of frames, one after the other.
-
-    Attributes
-    ----------
-    column : of the table, (n,) each, by name.
-    crops : patches, chips and strips, positions on the working grid and sizes, by name: a part a frame, after an empty
-        one;
-        of weak candidates `_WEAK_CROPS`.
-        They are not put together, as what is written is most of all that a block gives.
-    """
+    """Cars of a block of frames, one after the other."""
 
     column: dict[str, NDArray[Any]]
+    """Of the table, (n,) each, by name."""
     crops: dict[str, list[NDArray[Any]]]
+    """Patches, chips and strips, positions on the working grid and sizes, by name: a part a frame, after an empty one;
+    of weak candidates `_WEAK_CROPS`. They are not put together, as what is written is most of all that a block
+    gives."""
 
     def __len__(self) -> int:
         return len(self.column["frame"])
@@ -156,22 +151,18 @@ def _from_boxes(plan: Plan, working: WorkingGrid, frame: int, boxes: pd.DataFram
 
 @dataclass(frozen=True)
 class _Found:
-    """Cars and candidates found in a frame.
-
-    Attributes
-    ----------
-    detections : cars first, then weak candidates.
-    cars : number of cars among them.
-    xy_base : their positions (n, 2), base px.
-    scale : working px a base px.
-    searched : the fraction of the frame that was searched.
-    """
+    """Cars and candidates found in a frame."""
 
     detections: FrameDetections
+    """Cars first, then weak candidates."""
     cars: int
+    """Number of cars among them."""
     xy_base: Points
+    """Their positions (n, 2), base px."""
     scale: float
+    """Working px a base px."""
     searched: float
+    """The fraction of the frame that was searched."""
 
     @classmethod
     def in_frame(cls, detections: FrameDetections, cars: int, rectified: WorkingFrame, searched: float) -> "_Found":

@@ -20,22 +20,15 @@ Window = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class WorkingFrame:
-    """A window of one frame on the working grid.
-
-    Attributes
-    ----------
-    image, valid
-        (h, w) uint8 grey and bool: where the frame covers the window; elsewhere its edge goes on.
-    window
-        The window, base px.
-    scale
-        Working px a base px.
-    """
+    """A window of one frame on the working grid."""
 
     image: NDArray[np.uint8]
     valid: NDArray[np.bool_]
+    """(h, w) uint8 grey and bool: where the frame covers the window; elsewhere its edge goes on."""
     window: Window
+    """The window, base px."""
     scale: float
+    """Working px a base px."""
 
     def to_base(self, xy_work: NDArray[np.float64]) -> NDArray[np.float64]:
         """Working pixels (n, 2) -> base pixels (n, 2)."""

@@ -17,21 +17,17 @@ Transform = Callable[[GreyImage], GreyImage]
 
 @dataclass(frozen=True)
 class Modality:
-    """A representation in which two images are compared by normalised cross-correlation.
-
-    Attributes
-    ----------
-    name : as in messages.
-    transform : applied to both images, (h, w) uint8 to (h, w) uint8.
-    sign : of the correlation; -1 where what is bright in one image is dark in the other.
-    sift_transform : applied to the frame alone before its SIFT features are matched to those of the base image; None:
-        no SIFT candidate of this modality's own.
-    """
+    """A representation in which two images are compared by normalised cross-correlation."""
 
     name: str
+    """As in messages."""
     transform: Transform
+    """Applied to both images, (h, w) uint8 to (h, w) uint8."""
     sign: float = 1.0
+    """Of the correlation; -1 where what is bright in one image is dark in the other."""
     sift_transform: Transform | None = None
+    """Applied to the frame alone before its SIFT features are matched to those of the base image; None: no SIFT
+    candidate of this modality's own."""
 
 
 def identity(grey: GreyImage) -> GreyImage:

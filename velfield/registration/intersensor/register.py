@@ -63,32 +63,27 @@ _FINER_TEMPLATE_HALF_PX = 80
 
 @dataclass(frozen=True)
 class IntersensorResult:
-    """A frame's registration to the base image, with its quality metrics.
-
-    Attributes
-    ----------
-    transform : raw px -> base px: lens, then polyprojective.
-    model : the model of lower cross-validated error.
-    source_raw, target, cv_errors_px : (n, 2) raw px, (n, 2) base px, (n,) base px: control points and the
-        cross-validated error of each.
-    cv_error_px : their mean cross-validated error.
-    scale, rotation_rad : base px per frame px at the frame's centre, and rotation there, from +x towards +y.
-    method : how the coarse candidate was found.
-    error_map, error_map_spacing_px : (rows, columns) float32 mean cross-validated error about each node of a grid over
-        the base image, base px; NaN where no control point is near. Node (i, j) lies at base (j, i) times the spacing.
-    """
+    """A frame's registration to the base image, with its quality metrics."""
 
     transform: FrameTransform
+    """Raw px -> base px: lens, then polyprojective."""
     model: Model
+    """The model of lower cross-validated error."""
     source_raw: FloatArray
     target: FloatArray
     cv_errors_px: FloatArray
+    """(n, 2) raw px, (n, 2) base px, (n,) base px: control points and the cross-validated error of each."""
     cv_error_px: float
+    """Their mean cross-validated error."""
     scale: float
     rotation_rad: float
+    """Base px per frame px at the frame's centre, and rotation there, from +x towards +y."""
     method: str
+    """How the coarse candidate was found."""
     error_map: Float32Array
     error_map_spacing_px: int
+    """(rows, columns) float32 mean cross-validated error about each node of a grid over the base image, base px; NaN
+    where no control point is near. Node (i, j) lies at base (j, i) times the spacing."""
 
 
 def register_intersensor(

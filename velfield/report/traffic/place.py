@@ -46,23 +46,16 @@ class Label:
 
 @dataclass(frozen=True)
 class MapLabels:
-    """Where the labels and the arrows of a map stand.
-
-    Attributes
-    ----------
-    junctions, arms, numbers
-        Labels of the junctions, of the roads by which vehicles enter and leave, and of lanes.
-    arrows_m
-        (n, 2, 2) tail and tip of the arrows of the lanes.
-    unnumbered
-        Number of lanes without a number for want of room.
-    """
+    """Where the labels and the arrows of a map stand."""
 
     junctions: tuple[Label, ...]
     arms: tuple[Label, ...]
     numbers: tuple[Label, ...]
+    """Labels of the junctions, of the roads by which vehicles enter and leave, and of lanes."""
     arrows_m: FloatArray
+    """(n, 2, 2) tail and tip of the arrows of the lanes."""
     unnumbered: int
+    """Number of lanes without a number for want of room."""
 
 
 class _Boxes:

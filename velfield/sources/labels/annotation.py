@@ -11,23 +11,19 @@ from velfield.sources.labels.shapes import Point, rotated_corners
 
 @dataclass(frozen=True)
 class Annotation:
-    """A shape drawn on an image.
-
-    Attributes
-    ----------
-    image : the image's name in the file.
-    label : its class.
-    points : px from the first pixel's corner: one, the centre; two, opposite corners of an upright box; more, corners
-        around it.
-    rotation_rad : clockwise turn of the two corners' box about its centre; None where the format has none.
-    score : NaN where unknown.
-    """
+    """A shape drawn on an image."""
 
     image: str
+    """The image's name in the file."""
     label: Label
+    """Its class."""
     points: Sequence[Point]
+    """Px from the first pixel's corner: one, the centre; two, opposite corners of an upright box; more, corners around
+    it."""
     rotation_rad: float | None = None
+    """Clockwise turn of the two corners' box about its centre; None where the format has none."""
     score: float = math.nan
+    """NaN where unknown."""
 
     def corners(self) -> Sequence[Point]:
         """The points, those of a rotated box as its four corners."""

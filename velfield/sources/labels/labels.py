@@ -55,20 +55,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Labels:
-    """The labels of a source.
-
-    Attributes
-    ----------
-    cars : columns of `schemas.tables.LABEL_COLUMNS`.
-    ignored : the same columns for objects of other classes: neither cars nor background.
-    frames : every frame that is named, in the source's order, also those without a car; each is fully labelled.
-    notes : one line each, for the user: which classes are cars, how images were matched with frames.
-    """
+    """The labels of a source."""
 
     cars: pd.DataFrame
+    """Columns of `schemas.tables.LABEL_COLUMNS`."""
     ignored: pd.DataFrame
+    """The same columns for objects of other classes: neither cars nor background."""
     frames: tuple[str, ...]
+    """Every frame that is named, in the source's order, also those without a car; each is fully labelled."""
     notes: tuple[str, ...] = ()
+    """One line each, for the user: which classes are cars, how images were matched with frames."""
 
 
 def read_labels(path: Path | str, info: SourceInfo) -> Labels:

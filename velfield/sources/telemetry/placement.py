@@ -39,21 +39,17 @@ _Z90 = 1.645
 
 @dataclass(frozen=True)
 class FramePoses:
-    """Frames on the base image, (n,) each, and the telemetry at their times.
-
-    Attributes
-    ----------
-    telemetry : at the frames' times.
-    width, height : of a raw frame, px.
-    centre_xy : (n, 2) base pixels at the middle of the frame.
-    jacobian : (n, 2, 2) of raw -> base pixels there.
-    """
+    """Frames on the base image, (n,) each, and the telemetry at their times."""
 
     telemetry: Telemetry
+    """At the frames' times."""
     width: int
     height: int
+    """Of a raw frame, px."""
     centre_xy: Points
+    """(n, 2) base pixels at the middle of the frame."""
     jacobian: FloatArray
+    """(n, 2, 2) of raw -> base pixels there."""
 
     @property
     def scale(self) -> FloatArray:
@@ -157,18 +153,13 @@ def estimate_north(poses: FramePoses) -> North | Failure:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the base image lies.
-
-    Attributes
-    ----------
-    crs_wkt, affine : the UTM zone, and (column, row) of pixel corners to its coordinates, as
-        `velfield.sources.geo.BaseRaster`.
-    sd_m : standard deviation of a position in either direction, m.
-    """
+    """Where the base image lies."""
 
     crs_wkt: str
     affine: tuple[float, float, float, float, float, float]
+    """The UTM zone, and (column, row) of pixel corners to its coordinates, as `velfield.sources.geo.BaseRaster`."""
     sd_m: float
+    """Standard deviation of a position in either direction, m."""
 
 
 def estimate_place(poses: FramePoses, gsd_m: float, north: North) -> Place | Failure:

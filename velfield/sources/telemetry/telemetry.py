@@ -48,45 +48,41 @@ ABOVE_GROUND = HeightSource("above the ground", 5.0)
 
 @dataclass(frozen=True)
 class Telemetry:
-    """Records of the camera's pose, (n,) each.
-
-    Attributes
-    ----------
-    origin : where it was read, for messages: ``DJI_0001.SRT``, ``the subtitles of DJI_0001.MP4``.
-    time_s : ascending, s from the source's first frame.
-    latitude_deg, longitude_deg : position of the camera, WGS 84.
-    height_m : as ``height`` says.
-    altitude_m : above the sea or the ellipsoid: not comparable with the ground, whose altitude is not known.
-    yaw_deg : yaw of the camera, clockwise from north: the direction of the top of a picture taken straight down.
-    pitch_deg, roll_deg : pitch and roll of the camera; a pitch of -90 is straight down.
-    focal_35mm : focal length that gives the same diagonal angle of view on 36 mm x 24 mm, mm, before digital zoom.
-    focal_px : focal length, px of the picture; by the maker's calibration.
-    hfov_deg, vfov_deg : angle of view of the picture's width and of its height, at the zoom that there was.
-    zoom : digital zoom.
-    clock_s : the camera's clock, s since 1970 as if it were set to UTC; it shows local time unless ``is_utc``.
-    notes : one line each: what could not be read.
-    height : reference of ``height_m``.
-    is_utc : whether the clock shows UTC.
-    """
+    """Records of the camera's pose, (n,) each."""
 
     origin: str
+    """Where it was read, for messages: ``DJI_0001.SRT``, ``the subtitles of DJI_0001.MP4``."""
     time_s: FloatArray
+    """Ascending, s from the source's first frame."""
     latitude_deg: FloatArray
     longitude_deg: FloatArray
+    """Position of the camera, WGS 84."""
     height_m: FloatArray
+    """As ``height`` says."""
     altitude_m: FloatArray
+    """Above the sea or the ellipsoid: not comparable with the ground, whose altitude is not known."""
     yaw_deg: FloatArray
+    """Yaw of the camera, clockwise from north: the direction of the top of a picture taken straight down."""
     pitch_deg: FloatArray
     roll_deg: FloatArray
+    """Pitch and roll of the camera; a pitch of -90 is straight down."""
     focal_35mm: FloatArray
+    """Focal length that gives the same diagonal angle of view on 36 mm x 24 mm, mm, before digital zoom."""
     focal_px: FloatArray
+    """Focal length, px of the picture; by the maker's calibration."""
     hfov_deg: FloatArray
     vfov_deg: FloatArray
+    """Angle of view of the picture's width and of its height, at the zoom that there was."""
     zoom: FloatArray
+    """Digital zoom."""
     clock_s: FloatArray
+    """The camera's clock, s since 1970 as if it were set to UTC; it shows local time unless ``is_utc``."""
     notes: tuple[str, ...] = ()
+    """One line each: what could not be read."""
     height: HeightSource = ABOVE_TAKE_OFF
+    """Reference of ``height_m``."""
     is_utc: bool = False
+    """Whether the clock shows UTC."""
 
     @classmethod
     def from_records(

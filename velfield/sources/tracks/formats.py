@@ -39,32 +39,28 @@ class Speed:
 
 @dataclass(frozen=True)
 class TrackFormat:
-    """A format of tracks.
-
-    Attributes
-    ----------
-    name : as it is printed.
-    needs : columns by which it is recognised; the first format of `FORMATS` whose columns are all there is taken.
-    track : columns that name a vehicle together, where they exist.
-    positions : in order of preference; the first that has numbers is read, unless ``--unit`` asks for another.
-    times, frame : columns of the time with their units (None: by the values), and of the frame.
-    point : point of the vehicle that a position gives. A corner is the upper left one of a box; its sizes are in
-        ``size``.
-    speed : the speed by the file, with which the positions are compared.
-    size : columns of length (along x of a box) and width, and metres in their unit.
-    frame_rate : usual frames a second, for the message that asks for them.
-    """
+    """A format of tracks."""
 
     name: str
+    """As it is printed."""
     needs: tuple[str, ...]
+    """Columns by which it is recognised; the first format of `FORMATS` whose columns are all there is taken."""
     track: tuple[str, ...]
+    """Columns that name a vehicle together, where they exist."""
     positions: tuple[Position, ...]
+    """In order of preference; the first that has numbers is read, unless ``--unit`` asks for another."""
     times: tuple[tuple[str, TimeUnit | None], ...] = ()
     frame: str | None = None
+    """Columns of the time with their units (None: by the values), and of the frame."""
     point: Literal["centre", "front", "corner"] = "centre"
+    """Point of the vehicle that a position gives. A corner is the upper left one of a box; its sizes are in
+    ``size``."""
     speed: Speed | None = None
+    """The speed by the file, with which the positions are compared."""
     size: tuple[str, str, float] | None = None
+    """Columns of length (along x of a box) and width, and metres in their unit."""
     frame_rate: float | None = None
+    """Usual frames a second, for the message that asks for them."""
 
 
 def _metres_up(x: str = "x", y: str = "y") -> tuple[Position, ...]:

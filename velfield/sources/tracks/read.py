@@ -43,27 +43,23 @@ _NAMES = "name them track_id, time_s (or frame), x_m, y_m (or x_px, y_px)"
 
 @dataclass(frozen=True)
 class GivenPositions:
-    """Tracks as read from a file.
-
-    Attributes
-    ----------
-    table : ``track_id`` (int) and ``source_id``, its name in the file, ``frame`` (int), ``time_s`` from 0 on, ``x``,
-        ``y`` with y downwards; ``length_m``, ``width_m`` where the file has them (NaN: not known); by track and time.
-    unit : unit of ``x`` and ``y``: ``m`` or ``px``.
-    y_axis : where y points in the file.
-    crs_wkt : reference system of ``x`` and ``-y``: a UTM zone where the file has degrees; None: none.
-    y_is_north : whether ``-y`` is to the north of a map's grid whose reference system is not known.
-    speed : speeds of the rows by the file.
-    notes : notes on what was read and noticed, one line each.
-    """
+    """Tracks as read from a file."""
 
     table: pd.DataFrame
+    """``track_id`` (int) and ``source_id``, its name in the file, ``frame`` (int), ``time_s`` from 0 on, ``x``, ``y``
+    with y downwards; ``length_m``, ``width_m`` where the file has them (NaN: not known); by track and time."""
     unit: str
+    """Unit of ``x`` and ``y``: ``m`` or ``px``."""
     y_axis: YAxis
+    """Where y points in the file."""
     crs_wkt: str | None
+    """Reference system of ``x`` and ``-y``: a UTM zone where the file has degrees; None: none."""
     y_is_north: bool
+    """Whether ``-y`` is to the north of a map's grid whose reference system is not known."""
     speed: GivenSpeed | None
+    """Speeds of the rows by the file."""
     notes: tuple[str, ...]
+    """Notes on what was read and noticed, one line each."""
 
 
 def read_tracks(
