@@ -127,7 +127,7 @@ def _keep_memory() -> None:
 
 @contextmanager
 def kernels_beside() -> Iterator[None]:
-    """Compile the numba kernels, where none are cached, in another process by tiny jobs while this one works.
+    """Compile the later half of the numba kernels, where none are cached, in another process while this one works.
 
     A minute of a first run is waiting for the compiler on one processor, kernel after kernel; this way the later ones
     are cached when they are needed. Should it fail, nothing is lost.
@@ -135,7 +135,7 @@ def kernels_beside() -> Iterator[None]:
     if any(cache_root().rglob("*.nbi")):
         yield
         return
-    command = [sys.executable, "-m", "velfield.pipeline.compile_kernels"]
+    command = [sys.executable, "-m", "velfield.pipeline.compile_kernels", "--late"]
     with Popen(command, stdout=DEVNULL, stderr=DEVNULL) as beside:
         try:
             yield

@@ -23,7 +23,7 @@ def test_kernels_are_compiled_beside_a_first_run_only(
     started: list[subprocess.Popen[bytes]] = []
 
     def start(command: list[str], **options: int) -> "subprocess.Popen[bytes]":
-        assert command[1:] == ["-m", "velfield.pipeline.compile_kernels"]
+        assert command[1:] == ["-m", "velfield.pipeline.compile_kernels", "--late"]
         started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], **options))
         return started[-1]
 

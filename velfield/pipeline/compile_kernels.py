@@ -1,25 +1,34 @@
 """Have the kernels compiled: ``python -m velfield.pipeline.compile_kernels``.
 
-Tiny jobs are run and discarded; what numba compiles on the way is cached beside the modules. The first begins at what a
-run needs last, so that a first real run beside it, which begins at its frames, meets it half way.
+Tiny jobs are run and discarded; what numba compiles on the way is cached beside the modules. What a run needs last
+comes first: tracks to an analysis, two crops, two pictures, then flights. With ``--late`` there are no flights: a first
+real run beside it begins at its frames, and where both reached one kernel together, both would compile it, and every
+one after it.
 """
 
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from schemas.arrays import ByteArray
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job
 from schemas.scale import CAR_LENGTH_M
 from schemas.simulation import SimulationConfig
+from velfield.detection.crops import CHIP_PX
+from velfield.detection.detect import attach_crops, search_frame
+from velfield.detection.frame import ComparableFrame
+from velfield.detection.registry import shipped_detector
 from velfield.pipeline.analysis.analyse import analyse_run
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.given_tracks.plan import plan_tracks
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.synthetic.write import write_flight
+from velfield.tracking import appearance, crop_alignment
 
 _FLIGHT = SimulationConfig(frames=9, width=480, height=360, seed=3)
 _QUICK = {
@@ -29,14 +38,25 @@ _QUICK = {
     "detection.fine_tune_steps": 2,
     "gsd_m": 0.23,
 }
+_PICTURE_PX = (256, 256)
+_LATE = "--late"
 _SPEED_M_PER_S, _LENGTH_M, _EVERY_S, _VEHICLES = 10.0, 60.0, 2.0, 8
 
 
-def compile_kernels() -> None:
-    """Run tracks to an analysis, then a simulated flight to its maps: with nothing given, and with base and labels."""
+def compile_kernels(*, late_alone: bool = False) -> None:
+    """Run tracks to an analysis, link and detect, then simulated flights: with nothing given, and with base and labels.
+
+    Parameters
+    ----------
+    late_alone
+        Without the flights: for a run beside, which compiles what they would itself.
+    """
     with tempfile.TemporaryDirectory(prefix="velfield-kernels-") as folder:
         _process_tracks(Path(folder))
-        _process_flight(Path(folder))
+        _link_crops()
+        _search_pictures()
+        if not late_alone:
+            _process_flight(Path(folder))
 
 
 def _process_tracks(folder: Path) -> None:
@@ -58,6 +78,25 @@ def _crossing_streets() -> pd.DataFrame:
     return pd.DataFrame({"id": vehicle.astype(int), "time_s": time_s, "x_m": x_m, "y_m": y_m, "length_m": CAR_LENGTH_M})
 
 
+def _link_crops() -> None:
+    crops, axis_rad, first, second = _noise(2, CHIP_PX, CHIP_PX), np.zeros(2), np.array([0]), np.array([1])
+    prepared = appearance.prepare_crops(crops, axis_rad)
+    appearance.crop_differences(prepared, prepared, first, second)
+    alignable = crop_alignment.prepare_crops(crops, axis_rad)
+    crop_alignment.align_prepared(alignable, alignable, first, second)
+
+
+def _search_pictures() -> None:
+    before, after = (ComparableFrame(picture, np.ones(picture.shape, bool)) for picture in _noise(2, *_PICTURE_PX))
+    reference = search_frame(shipped_detector(), before)
+    attach_crops(before.image, reference.detections)
+    search_frame(shipped_detector(), after, reference=reference)
+
+
+def _noise(*shape: int) -> ByteArray:
+    return np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+
+
 def _process_flight(folder: Path) -> None:
     write_flight(folder / "flight", _FLIGHT)
     given = Inputs.from_simulated_flight(folder / "flight")
@@ -69,4 +108,4 @@ def _process_flight(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    compile_kernels()
+    compile_kernels(late_alone=_LATE in sys.argv)

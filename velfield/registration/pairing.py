@@ -31,7 +31,8 @@ _THRESHOLD_FRACTION = 0.012
 """Inlier threshold of the homography over the image diagonal: wide enough for the distortion of an unknown lens."""
 _TRIAL_DISTORTION = 0.05
 _MIN_DETERMINANT = 1e-6
-_WINDOW_PX, _WINDOW_LEVELS = 21, 1
+_WINDOW_PX, _WINDOW_LEVELS, _PATCH_PX = 21, 1, 64
+"""Window of the alignment and levels above full size; the patches hold the window at half size, and what it moves."""
 _MAX_ROUND_TRIP_PX = 0.2
 """Largest distance between a point and where it lies after alignment into the other frame and back."""
 _MAX_CORRECTION_PX = 1.5
@@ -71,24 +72,30 @@ def align_matches(
 ) -> tuple[FloatArray, FloatArray]:
     """The matches (n, 2) of a frame pair that Lucas-Kanade confirms at full size, with its positions in frame j.
 
-    Frame j is warped by the matches' homography first, so that the windows differ by a shift. All matches, unchanged,
-    where it confirms fewer than 40.
+    Frame j is warped about the matches by their homography first, so that the windows differ by a shift. All matches,
+    unchanged, where it confirms fewer than 40.
     """
     matrix, _ = cv2.findHomography(xy_j, xy_i, 0)
     if matrix is None or abs(np.linalg.det(matrix)) < _MIN_DETERMINANT:
         return xy_i, xy_j
-    height, width = frame_i.shape
-    warped = cv2.warpPerspective(frame_j, matrix, (width, height), flags=cv2.INTER_CUBIC)
-    start = xy_i.astype(np.float32)[:, None]
-    guess = cv2.perspectiveTransform(xy_j[:, None], matrix).astype(np.float32)
-    moved, found = _follow(frame_i, warped, start, guess)
-    back, found_back = _follow(warped, frame_i, moved, start)
+    # One patch a match, all below each other in one picture: alignment at full size would work through whole frames.
+    corners = np.rint(xy_i).astype(np.int64) - _PATCH_PX // 2
+    places = corners[:, None, None] + np.stack(np.meshgrid(*[np.arange(_PATCH_PX)] * 2), axis=-1)
+    columns, rows = np.clip(places.reshape(-1, _PATCH_PX, 2), 0, np.array(frame_i.shape[::-1]) - 1).transpose(2, 0, 1)
+    places_j = cv2.perspectiveTransform(places.reshape(-1, 1, 2).astype(np.float64), np.linalg.inv(matrix))
+    patches_i = frame_i[rows, columns]
+    patches_j = cv2.remap(frame_j, places_j.reshape(-1, _PATCH_PX, 2).astype(np.float32), None, cv2.INTER_CUBIC)
+    origins = corners[:, None] - np.arange(len(xy_i))[:, None, None] * [0, _PATCH_PX]
+    start = (xy_i[:, None] - origins).astype(np.float32)
+    guess = (cv2.perspectiveTransform(xy_j[:, None], matrix) - origins).astype(np.float32)
+    moved, found = _follow(patches_i, patches_j, start, guess)
+    back, found_back = _follow(patches_j, patches_i, moved, start)
     corrected = np.hypot(*(moved - guess)[:, 0].T) < _MAX_CORRECTION_PX / _image_scale(frame_i)
     kept = found & found_back & corrected & (np.hypot(*(back - start)[:, 0].T) < _MAX_ROUND_TRIP_PX)
     if kept.sum() < _MIN_MATCHES:
         return xy_i, xy_j
-    there = cv2.perspectiveTransform(moved[kept].astype(np.float64), np.linalg.inv(matrix))[:, 0]
-    return start[kept, 0].astype(np.float64), np.asarray(there)
+    there = cv2.perspectiveTransform((moved + origins)[kept].astype(np.float64), np.linalg.inv(matrix))[:, 0]
+    return xy_i[kept], np.asarray(there)
 
 
 def _follow(source: GreyImage, target: GreyImage, xy: Float32Array, guess: Float32Array) -> tuple[Float32Array, Mask]:
