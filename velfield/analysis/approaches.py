@@ -102,10 +102,9 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
         )
     least, most = f"{by_s - reach_s:.0f}", f"{by_s + reach_s:.0f}"
     longer = f"at least {least} s" if longest.partly else f"{by_s:.0f} s ({least} to {most})"
-    least_of_all = ", who wait least" if len(delays) > 2 else ""
     return (
         f"it is not fair by waiting time: vehicles from {longest.arm} wait {longer} longer than those from "
-        f"{shortest.arm}{least_of_all}"
+        f"{shortest.arm}"
         + (", as far as is seen" if shortest.partly else "")
         + (f"; the delay from {list_text(unknown)} is not known" if unknown else "")
     )

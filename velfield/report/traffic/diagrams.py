@@ -74,7 +74,7 @@ def traffic_diagrams(
             f"ways, if any: fewer than {MIN_PASSES} were seen to go. "
             f"Arms are named by where they lead to ({analysis.arm_names.legend}).",
             partial(draw_turning, found=found),
-            turning_height_in(found, WIDTH_IN),
+            turning_height_in(found, 0.88 * WIDTH_IN),
             bare=True,
         )
         delays = approach_delays(analysis, found)
@@ -89,7 +89,7 @@ def traffic_diagrams(
                 "Manual, 7th edition (A: best, F: worst), between the dashed lines."
                 + (f" From {list_text(unknown)} too few were seen so far, or went freely." if unknown else ""),
                 partial(draw_delays, delays=delays),
-                1.5 + 0.4 * len(delays),
+                1.1 + 0.32 * len(delays),
             )
         yield from _signal_diagrams(analysis, found)
     yield from _road_diagrams(analysis, junctions, unit)

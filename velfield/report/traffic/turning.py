@@ -1,5 +1,6 @@
 """The turning-movement diagram of a junction: arrows as wide as the flow, arms where their roads lead."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,8 @@ _ACROSS, _LABEL_AT, _LINE = 4.4, 1.12, 0.12
 """Width of the diagram, distance of its labels from the middle and height of a line of them, in lengths of an arm."""
 _MARGIN = 0.1
 _FROM, _FROM_STEP, _TO, _TO_STEP = 0.1, 0.09, 0.1, 0.06
-"""The widest arrow of an arm begins so far to the right of it, each next a step farther; where arrows end likewise."""
+"""The arrow of an arm that turns farthest to the left begins so far to the right of it, each next a step farther; where
+arrows end likewise: so those of one arm do not cross."""
 _THIN, _THICK, _HEAD = 0.006, 0.06, 0.06
 """Half of the width of the thinnest and the thickest shaft; a head is wider by this to each side."""
 
@@ -60,10 +62,10 @@ def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
         outward, aside = _axes_of(angle[arm.name])
         tone = TONES[k % len(TONES)]
         mine = _movements(found, arm_in=arm.name)
-        for rank, m in enumerate(mine):
+        for rank, m in enumerate(_by_turn(mine, angle)):
             out, out_aside = _axes_of(angle[m.arm_out])
             begin = -aside * (_FROM + _FROM_STEP * rank)
-            end = out_aside * (_TO + _TO_STEP * _movements(found, arm_out=m.arm_out).index(m))
+            end = out_aside * (_TO + _TO_STEP * _by_turn(_movements(found, arm_out=m.arm_out), angle).index(m))
             bent = np.stack([outward + begin, 0.25 * outward + begin, 0.25 * out + end, out + end])
             line = BPoly(bent[:, None], [0, 1])(np.linspace(0, 1, 60))
             half = _THIN + (_THICK - _THIN) * (m.seen + m.inferred) / most
@@ -87,6 +89,11 @@ def _movements(found: JunctionMovements, *, arm_in: str | None = None, arm_out: 
     """Those from an arm, or to one, with most vehicles first."""
     mine = [m for m in found.movements if arm_in in (None, m.arm_in) and arm_out in (None, m.arm_out)]
     return sorted(mine, key=lambda m: -(m.seen + m.inferred))
+
+
+def _by_turn(movements: list[Movement], angle: Mapping[str, float]) -> list[Movement]:
+    """Those that turn farthest to the left first, those that turn back before all."""
+    return sorted(movements, key=lambda m: (angle[m.arm_out] - angle[m.arm_in] + 1e-6) % (2 * np.pi))
 
 
 def _label(arm: Arm, movements: list[Movement], found: JunctionMovements) -> list[str]:
