@@ -370,10 +370,9 @@ def _find_vertices(
 def _count_samples(first: IntArray, xy: FloatArray, spacing: float, min_step: float) -> IntArray:
     """Points ``spacing`` apart along each track (tracks,)."""
     steps = np.zeros(len(first) - 1, np.int64)
-    most = np.max(np.diff(first)) if len(steps) else 0
-    vertex, along = np.empty(most, np.int64), np.empty(most)
     for k in range(len(steps)):
-        _, length = _find_vertices(xy, first[k], first[k + 1], min_step, vertex, along)
+        a, b = first[k], first[k + 1]
+        _, length = _find_vertices(xy, a, b, min_step, np.empty(b - a, np.int64), np.empty(b - a))
         steps[k] = int(length / spacing) + 1 if length >= 2 * spacing else 0
     return steps
 

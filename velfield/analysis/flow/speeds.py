@@ -291,7 +291,10 @@ def slowing(
         begin = k - _AWAY_M
         if begin < a or min(k + _WAY_M, end) - k < _MIN_WAY_M:
             continue
-        if np.max(np.diff(time_s[begin:k])) > _WAITS_S:
+        waits = False
+        for q in range(begin + 1, k):
+            waits |= time_s[q] - time_s[q - 1] > _WAITS_S
+        if waits:
             continue
         low = k + np.argmin(speed[k : min(k + _WAY_M, end)])
         if speed[low] < _STANDS_M_PER_S:
