@@ -612,6 +612,16 @@ def test_pairs_that_errors_leave_in_doubt_are_neither_counted_nor_denied(gap_m: 
     assert ("1 seen, too few to say how often: " in answer.text) == (state == "found")
 
 
+@pytest.mark.parametrize(("together_m", "found"), [(5.0, False), (20.0, True)])
+def test_lanes_that_meet_at_the_edge_of_the_view_do_not_merge(together_m: float, found: bool) -> None:
+    """Errors of the last positions may put two vehicles side by side onto one lane."""
+    beside = np.array([[0.0, 3.6], [148.5 - together_m, 3.6], [150.0 - together_m, 0.3], [150.0, 0.1]])
+    tracks = [drive(np.array([[0.0, 0.0], [150.0, 0.0]]), 9.0 * k) for k in range(9)]
+    analysis = TrafficAnalysis(gather(tracks + [drive(beside, 9.0 * k + 0.5) for k in range(9)]))
+    assert any(len(analysis.lanes.predecessors[lane.number]) == 2 for lane in analysis.lanes)
+    assert any(c.kind == "merging" for c in analysis.conflicts) == found
+
+
 def in_two_clips(
     second_s: float, begin_s: float, cut_s: float, end_s: float, *, waits_s: float = 0.0
 ) -> TrafficAnalysis:

@@ -43,6 +43,8 @@ _ONE_LEVEL_BEFORE, _LEAST_ONE_LEVEL, _CLEARLY_ONE_LEVEL = 0.1, 0.05, 0.9
 """Few pairs do not rule out two levels: to be taken for one level roads must be ten times as likely on it."""
 _JOINED_M = 4.0
 """A lane that joins another is on it so far after its own end."""
+_GOES_ON_M = 10.0
+"""Lanes that join for less, and end, are beside each other up to the edge of the view, where positions are worst."""
 _APART_M = 1.8
 """Lanes that lie nearer to each other on their whole way, and by errors, are one."""
 _ON_LANE_M = 3.5
@@ -191,7 +193,10 @@ def _merges(
             continue
         # where the last of the lanes has joined: the first joins at the start of this one
         ends = np.array([graph.lanes[k].xy_m[-1] for k in sources])
-        place = min(float(project(ends, lane.xy_m)[0].max()) + _JOINED_M, 0.9 * lane.length_m)
+        joined_m = float(project(ends, lane.xy_m)[0].max())
+        if not graph.successors[lane.number] and lane.length_m < joined_m + _GOES_ON_M:
+            continue
+        place = min(joined_m + _JOINED_M, 0.9 * lane.length_m)
         at = traffic.passings(lane.number, place)
         source = _sources(vehicle[at.track], [vehicle[traffic.samples(k).track] for k in sources])
         known = source >= 0
