@@ -177,11 +177,13 @@ def find_movements(
         for junction, rows in zip(graph.junctions, inside, strict=True)
         if junction.kind in ("intersection", "roundabout")
     ]
-    waits_elsewhere = np.unique(np.concatenate([_NOWHERE, *meet]))
+    elsewhere = np.zeros(len(samples), bool)
+    elsewhere[np.concatenate([_NOWHERE, *meet])] = True
+    waits_elsewhere, waits = np.flatnonzero(elsewhere), _waits(samples)
     out = []
     for junction, rows in zip(graph.junctions, inside, strict=True):
         gates = find_gates(graph, junction, names)
-        passes = _passes(samples, rows, gates, waits_elsewhere)
+        passes = _passes(samples, rows, gates, waits, waits_elsewhere)
         passes = _within(_by_track(passes, cut), *trajectories.window_s)
         movements, delays_s = _count(junction, gates, passes, slices, trajectories.observed_s)
         out.append(JunctionMovements(junction, gates, passes, movements, delays_s))
@@ -196,10 +198,15 @@ def _inside(samples: PathSamples, junction: Junction) -> IntArray:
 
 def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passes:
     """Tracks in the area of a junction."""
-    return _passes(samples, _inside(samples, junction), gates, _NOWHERE)
+    return _passes(samples, _inside(samples, junction), gates, _waits(samples), _NOWHERE)
 
 
-def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits_elsewhere: IntArray) -> Passes:
+def _waits(samples: PathSamples) -> IntArray:
+    """(rows,) number of stops up to each of the samples, over all tracks."""
+    return np.cumsum(np.diff(samples.time_s, prepend=samples.time_s[:1]) > _WAITS_S)
+
+
+def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits: IntArray, waits_elsewhere: IntArray) -> Passes:
     """Tracks in the area of a junction, which rows ``inside`` of the samples are in; ``waits_elsewhere``: rows, in
     order, in areas where vehicles wait for each other: delays begin behind the last one."""
     if not len(inside):
@@ -229,7 +236,6 @@ def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits_elsewher
         before = np.searchsorted(waits_elsewhere, up, side="right") - 1
         far = np.maximum(far, np.where(before >= 0, waits_elsewhere[before], -1) + 1)
     far = np.where(reaches, np.minimum(far, up), up)
-    waits = np.r_[0, np.cumsum(np.diff(samples.time_s) > _WAITS_S)]
     return Passes(
         samples.track[first],
         gate_in,
