@@ -146,7 +146,7 @@ STAGES: tuple[Stage, ...] = (
     # Calibrate from edge points and control points of frames spread over the flight.
     Stage(
         name="lens",
-        version=11,
+        version=12,
         label="lens",
         lines=(
             Line("no distortion was established; pinhole model used", lambda counts: not counts.get("corner_px")),

@@ -80,11 +80,14 @@ def align_matches(
         return xy_i, xy_j
     # One patch a match, all below each other in one picture: alignment at full size would work through whole frames.
     corners = np.rint(xy_i).astype(np.int64) - _PATCH_PX // 2
-    places = corners[:, None, None] + np.stack(np.meshgrid(*[np.arange(_PATCH_PX)] * 2), axis=-1)
-    columns, rows = np.clip(places.reshape(-1, _PATCH_PX, 2), 0, np.array(frame_i.shape[::-1]) - 1).transpose(2, 0, 1)
-    places_j = cv2.perspectiveTransform(places.reshape(-1, 1, 2).astype(np.float64), np.linalg.inv(matrix))
-    patches_i = frame_i[rows, columns]
-    patches_j = cv2.remap(frame_j, places_j.reshape(-1, _PATCH_PX, 2).astype(np.float32), None, cv2.INTER_CUBIC)
+    columns, rows = (corners[:, k, None] + np.arange(_PATCH_PX) for k in (0, 1))
+    places = np.empty((len(corners), _PATCH_PX, _PATCH_PX, 2), np.float32)
+    places[..., 0], places[..., 1] = columns[:, None], rows[:, :, None]
+    places_j = cv2.perspectiveTransform(places.reshape(-1, _PATCH_PX, 2), np.linalg.inv(matrix))
+    height, width = frame_i.shape
+    patches_i = frame_i[rows.clip(0, height - 1)[:, :, None], columns.clip(0, width - 1)[:, None]]
+    patches_i = patches_i.reshape(-1, _PATCH_PX)
+    patches_j = cv2.remap(frame_j, places_j, None, cv2.INTER_CUBIC)
     origins = corners[:, None] - np.arange(len(xy_i))[:, None, None] * [0, _PATCH_PX]
     start = (xy_i[:, None] - origins).astype(np.float32)
     guess = (cv2.perspectiveTransform(xy_j[:, None], matrix) - origins).astype(np.float32)
