@@ -95,7 +95,6 @@ def test_no_coordination_is_reported_as_such(analysis: TrafficAnalysis, pair: Tr
     assert offset_table(analysis).note.startswith("No offsets")
     first, second = (n for n, s in pair.signals.items() if s.signalised)
     cycle = pair.signals[second].cycle_s
-    assert cycle is not None
     other = dict(pair.signals) | {second: replace(pair.signals[second], cycle_s=cycle.in_units(1.5))}
     offsets, reason = find_offsets(other, pair.lanes, pair.trajectories.observed_s)
     assert offsets == []

@@ -33,12 +33,10 @@ def first_stream(analysis: TrafficAnalysis) -> Stream:
 def test_a_tree_over_the_stop_line_does_not_move_it(whole: TrafficAnalysis) -> None:
     """The first of a queue is seen again where it drives already: it did not stand there."""
     stream = first_stream(whole)
-    assert stream.stop_line_m is not None
     front = stream.approach.path_m[int(stream.stop_line_m)]
     tree = front + np.array([[-4.0, -3.0], [3.0, 3.0]])
     hidden = TrafficAnalysis(gather([without(track, *tree) for track in crossroads()]))
     found = first_stream(hidden)
-    assert found.stop_line_m is not None
     at, was = (s.approach.path_m[0, 0] + (s.stop_line_m or 0.0) for s in (found, stream))
     assert at == pytest.approx(was, abs=1.0)
     assert len(found.head_time_s) == len(stream.head_time_s)
@@ -75,7 +73,6 @@ def test_the_onset_of_red_is_where_crossings_end() -> None:
             times.append(t[kept] + cycle * CYCLE_S)
         crossings = np.sort(np.concatenate(times))
         found = _red_onset(crossings, 0.0, Estimate(CYCLE_S, CYCLE_S, CYCLE_S, cycles))
-        assert found is not None
         errors.append(found.value - red_s)
         held.append(found.low <= red_s <= found.high)
     assert np.mean(errors) == pytest.approx(0.0, abs=0.1)

@@ -34,7 +34,6 @@ def test_intervals_of_vehicles_in_platoons_hold_the_long_run() -> None:
             ("mean", estimate_mean(speed, time_s)), ("median", estimate_quantile(speed, 0.5, time_s)),
             ("as if independent", estimate_mean(speed)),
         ):  # fmt: skip
-            assert found is not None
             assert found.n == len(speed)
             held[name].append(found.low <= 14 <= found.high)
     assert 0.84 <= np.mean(held["mean"]) <= 0.97
@@ -49,7 +48,6 @@ def test_intervals_of_few_skewed_values_hold_their_mean_and_stay_in_reach(n: int
     assert 0.82 <= np.mean([one.low <= 1.0 <= one.high for one in found if one]) <= 0.96
     assert min(one.low for one in found if one) >= 0.0
     in_platoon = estimate_mean(np.array([34.0, 34.0, 35.0, 36.0, 41.0]), 2.0 * np.arange(5), spread=(9.0, 8))
-    assert in_platoon is not None
     assert 18 < in_platoon.low < in_platoon.high < 57
 
 

@@ -23,12 +23,8 @@ def test_the_gap_is_from_bumper_to_bumper() -> None:
     cars = TrafficAnalysis(gather([drive(EAST, 2.0 * k) for k in range(30)]))
     lorries = with_lengths(cars, LORRY_M)
     (car,), (lorry,) = cars.flows, lorries.flows
-    assert car.gap_s is not None
-    assert lorry.gap_s is not None
     assert car.gap_s.value == pytest.approx(2.0 - VEHICLE_LENGTH_M / 12.0, abs=0.05)
     assert lorry.gap_s.value == pytest.approx(2.0 - LORRY_M / 12.0, abs=0.05)
-    assert car.headway_s is not None
-    assert lorry.headway_s is not None
     assert car.headway_s.value == lorry.headway_s.value
 
 
@@ -36,7 +32,6 @@ def test_a_mixed_pair_has_the_mean_of_both_lengths() -> None:
     tracks = gather([drive(EAST, 2.0 * k) for k in range(30)])
     mixed = replace(tracks, measured_length_m=np.where(np.arange(30) % 2, LORRY_M, np.nan))
     (flow,) = TrafficAnalysis(mixed).flows
-    assert flow.gap_s is not None
     assert flow.gap_s.value == pytest.approx(2.0 - (LORRY_M + VEHICLE_LENGTH_M) / 2 / 12.0, abs=0.05)
 
 
@@ -45,8 +40,6 @@ def test_a_queue_ends_at_its_last_vehicles_rear() -> None:
     longer = with_lengths(cars, 6.5)
     for a, b in zip(cars.signals.values(), longer.signals.values(), strict=True):
         for s, t in zip(a.streams, b.streams, strict=True):
-            assert s.stream.stop_line_m is not None
-            assert t.stream.stop_line_m is not None
             # the same centres: both bumpers are a metre farther out
             assert t.stream.stop_line_m - s.stream.stop_line_m == pytest.approx(1.0, abs=0.3)
             rows = zip(queues(s.stream, s.green_s[1:-1]), queues(t.stream, t.green_s[1:-1]), strict=True)

@@ -31,7 +31,6 @@ def signals_are_true_or_withheld(analysis: TrafficAnalysis) -> int:
         if signal.signalised is None:
             assert signal.reason.startswith("too little data")
         else:
-            assert signal.cycle_s is not None
             assert signal.cycle_s.low - 0.5 <= CYCLE_S <= signal.cycle_s.high + 0.5
             found += 1
     return found

@@ -31,13 +31,11 @@ def whole() -> TrafficAnalysis:
 
 def counts(analysis: TrafficAnalysis) -> dict[tuple[str, str], float]:
     scene = analysis.scene
-    assert scene is not None
     return {(r.origin.name, r.destination.name): r.vehicles for r in scene.relations}
 
 
 def test_entries_and_exits_are_found_and_counted(whole: TrafficAnalysis) -> None:
     scene = whole.scene
-    assert scene is not None
     assert {(arm.name, tuple(np.round(arm.xy_m, -1))) for arm in scene.arms} == {
         ("N", (150, 0)),
         ("E", (260, 100)),
@@ -49,7 +47,6 @@ def test_entries_and_exits_are_found_and_counted(whole: TrafficAnalysis) -> None
     assert scene.before == 1
     assert scene.unknown == 0
     share = next(r.share for r in scene.relations if (r.origin.name, r.destination.name) == ("W", "S"))
-    assert share is not None
     assert share.value == pytest.approx(12 / 59)
 
 
@@ -63,7 +60,6 @@ def test_two_clips_of_the_same_traffic_have_the_flows_of_one(whole: TrafficAnaly
 
     def flows(analysis: TrafficAnalysis) -> dict[tuple[str, str], float]:
         scene = analysis.scene
-        assert scene is not None
         moves = [m for found in analysis.movements for m in found.movements]
         return {("junction", m.arm_in + m.arm_out): m.flow_veh_per_h.value for m in moves if m.flow_veh_per_h} | {
             (r.origin.name, r.destination.name): r.flow_veh_per_h.value for r in scene.relations if r.flow_veh_per_h
@@ -88,7 +84,6 @@ def test_tracks_that_are_cut_go_where_the_others_went(whole: TrafficAnalysis) ->
         made += cut(tracks[k], begin=0.3, end=0.9)
     analysis = TrafficAnalysis(gather(made))
     scene = analysis.scene
-    assert scene is not None
     found = {(r.origin.name, r.destination.name): r for r in scene.relations}
     assert found["W", "S"].seen == 8
     assert found["W", "E"].seen == 39
@@ -124,11 +119,9 @@ def test_who_leaves_by_a_road_that_hardly_anybody_takes_went_elsewhere(whole: Tr
     north = np.concatenate([EAST[:1], [[60.0, 100.0], [70.0, 90.0], [70.0, 0.0]]])
     tracks = [drive(EAST, 5.0 + 8.0 * k) for k in range(10)] + [drive(north, 9.0 + 40.0 * k) for k in range(2)]
     scene = TrafficAnalysis(gather([drive(SOUTH, 0.0), *tracks])).scene
-    assert scene is not None
     assert int(scene.trips.elsewhere.sum()) == 2
     (east,) = [r for r in scene.relations if r.origin.name == "W"]
     assert east.vehicles == 10
-    assert east.share is not None
     assert east.share.value == pytest.approx(10 / 12)
 
 
@@ -137,7 +130,6 @@ def test_who_is_still_there_at_the_end_is_told_apart() -> None:
     last = float(tracks[-1][0][0]) + 7.0
     shown = [(t[t <= last], xy[t <= last]) for t, xy in tracks]
     scene = TrafficAnalysis(gather([track for track in shown if len(track[0]) > 5])).scene
-    assert scene is not None
     (only,) = scene.relations
     assert only.cut == 0
     assert only.remaining == 4  # who entered after 61 s: a vehicle needs 21.7 s, one comes every 4 s

@@ -89,13 +89,10 @@ def test_turning_counts_and_shares(analysis: TrafficAnalysis) -> None:
     assert found["W", "S"].turn == "right"
     assert found["N", "S"].seen == 48
     share = found["W", "S"].share
-    assert share is not None
     assert share.value == pytest.approx(0.2)
     assert share.low < 0.2 < share.high
     # 60 m and the junction at 12 m/s are some 6 s
     delay, travel = found["W", "E"].delay_s, found["W", "E"].travel_time_s
-    assert delay is not None
-    assert travel is not None
     assert travel.value - delay.value == pytest.approx(6.0, abs=0.7)
 
 
@@ -162,8 +159,6 @@ def test_who_waits_far_before_a_junction_is_delayed_too() -> None:
     analysis = TrafficAnalysis(gather(tracks))
     found = {(m.arm_in, m.arm_out): m for j in analysis.movements for m in j.movements}
     delay, travel = found["W", "E"].delay_s, found["W", "E"].travel_time_s
-    assert delay is not None
-    assert travel is not None
     assert travel.value == pytest.approx(6.0, abs=0.7)  # over 60 m, on which nobody stands
     lost_s = [times[-1] - times[0] - 260.0 / SPEED for times, _ in tracks[12:24]]
     assert delay.value == pytest.approx(np.mean(lost_s) / 2, rel=0.15)
@@ -197,7 +192,6 @@ def test_a_vehicle_that_stands_for_most_of_a_clip_does_not_outweigh_the_others()
     analysis = TrafficAnalysis(gather([(times[rows], xy[rows]) for times, xy, rows in in_clip]))
     found = {(m.arm_in, m.arm_out): m for j in analysis.movements for m in j.movements}
     travel = found["W", "E"].travel_time_s
-    assert travel is not None
     assert travel.n == 12
     assert 9.6 < travel.value < 13.0
     assert travel.low < 9.6
@@ -208,7 +202,6 @@ def test_turns_from_a_lane_that_two_vehicles_drove_are_of_its_road() -> None:
     (junction,) = TrafficAnalysis(gather([*crossroads(), drive(beside, 7.0), drive(beside, 47.0)])).movements
     right = next(m for m in junction.movements if (m.arm_in, m.arm_out) == ("W", "S"))
     assert right.seen == 14
-    assert right.share is not None
     assert right.share.value == pytest.approx(14 / 62, abs=1e-6)
 
 
@@ -232,7 +225,6 @@ def test_a_tree_that_cuts_one_movement_leaves_shares_and_counts_as_they_are() ->
     assert straight.seen < 25
     assert straight.seen + straight.inferred == pytest.approx(48)
     assert right.seen == 12
-    assert right.share is not None
     assert right.share.value == pytest.approx(0.2)
 
 
@@ -240,7 +232,6 @@ def test_the_cycle_green_and_queues(analysis: TrafficAnalysis) -> None:
     junction = next(j for j in analysis.lanes.junctions if j.kind == "intersection")
     signal = analysis.signals[junction.number]
     assert signal.signalised
-    assert signal.cycle_s is not None
     assert signal.cycle_s.value == pytest.approx(CYCLE_S, abs=0.3)
     assert signal.cycle_s.low < CYCLE_S < signal.cycle_s.high
     greens = sorted((s.green_phase_s.value + 5) % CYCLE_S - 5 for s in signal.streams)
@@ -278,7 +269,6 @@ def test_the_mean_speed_of_a_short_lane_is_that_of_its_vehicles(length_m: float)
     """A lane ends before the paths that made it do: the time beyond its ends counted, the distance did not."""
     path = np.array([[0.0, 100.0], [length_m, 100.0]])
     (flow,) = TrafficAnalysis(gather([drive(path, 6.0 * k) for k in range(30)])).flows
-    assert flow.space_mean_speed_m_per_s is not None
     assert flow.space_mean_speed_m_per_s.value == pytest.approx(SPEED, rel=0.01)
 
 
@@ -290,10 +280,8 @@ def test_flow_is_of_the_times_that_are_seen() -> None:
     analysis = TrafficAnalysis(replace(whole, gaps_s=np.array([[last, 1980.0]])), slice_s=100.0)
     assert analysis.trajectories.duration_s == pytest.approx(2 * last, abs=1.0)
     flow = max(analysis.flows, key=lambda one: one.flow_veh_per_h.value if one.flow_veh_per_h else 0.0)
-    assert flow.flow_veh_per_h is not None
     assert flow.flow_veh_per_h.value == pytest.approx(90 / (2 * last) * 3600, rel=0.02)
     assert flow.flow_veh_per_h.low > 600
-    assert flow.headway_s is not None
     assert flow.headway_s.value == pytest.approx(4.0, abs=0.05)
     slices = flow_slices(analysis.lane_traffic, flow.lane, analysis.trajectories.observed_s)
     assert len(slices.slices) == 6
@@ -488,7 +476,6 @@ def test_lower_bounds_do_not_draw_a_median_down() -> None:
         wish, ahead = rng.normal(50, 5, 120), rng.normal(50, 6, 120)
         free = ahead > wish
         found = estimate_censored_quantile(np.minimum(wish, ahead), free, 0.5)
-        assert found is not None
         hits.append(found.low <= 50 <= found.high)
         errors.append(found.value - 50)
         naive.append(np.median(wish[free]) - 50)
@@ -637,7 +624,6 @@ def in_two_clips(
 def test_a_signal_is_found_in_both_clips_though_the_gap_is_no_whole_number_of_cycles() -> None:
     analysis = in_two_clips(1013.0, 0.0, 250.0, 500.0)
     (signal,) = (s for s in analysis.signals.values() if s.signalised)
-    assert signal.cycle_s is not None
     assert signal.cycle_s.value == pytest.approx(CYCLE_S, abs=0.15)
     for stream in signal.streams:
         green = stream.green_s

@@ -29,8 +29,6 @@ def test_intervals_of_shares_hold_the_truth() -> None:
     for _ in range(n):
         found = find_classes(*measured(rng, 300, 0.08))
         _, car, heavy = found.estimate_shares(np.arange(300))
-        assert car is not None
-        assert heavy is not None
         hits += [heavy.low <= 0.08 <= heavy.high, car.low <= 0.92 <= car.high]
     assert (hits / n >= 0.84).all()
     assert (hits / n <= 0.97).all()
@@ -41,8 +39,6 @@ def test_shares_of_a_part_are_its_own() -> None:
     parts = [measured(rng, 400, share) for share in (0.0, 0.3)]
     found = find_classes(*(np.concatenate([part[k] for part in parts]) for k in (0, 1)))
     few, many = (found.estimate_shares(np.arange(first, first + 400))[HEAVY] for first in (0, 400))
-    assert few is not None
-    assert many is not None
     assert few.low == pytest.approx(0.0, abs=0.002)
     assert few.high < 0.02
     assert many.low < 0.3 < many.high
@@ -55,7 +51,6 @@ def test_a_share_is_as_uncertain_as_the_dimensions() -> None:
     assert sharp.separability[HEAVY] > 0.97
     assert rough.separability[HEAVY] < 0.9
     one, other = (found.estimate_shares(every)[HEAVY] for found in (sharp, rough))
-    assert one is not None
     assert other is not None
     width = [(e.high - e.low) / np.sqrt(e.value * (1 - e.value)) for e in (one, other)]  # of 200 certain ones: equal
     assert width[1] > 1.05 * width[0]
@@ -71,7 +66,6 @@ def test_vehicles_that_were_not_measured_are_left_out() -> None:
     found = find_classes(holes, sd)
     assert found.measured.tolist() == list(range(1, 60, 2))
     share = found.estimate_shares(np.arange(60))[CAR]
-    assert share is not None
     assert share.n == 30
     assert found.estimate_shares(np.arange(0, 60, 2)) == (None,) * 3
     assert find_classes(np.full((4, 2), np.nan), np.full((4, 2), np.nan)).estimate_shares(np.arange(4)) == (None,) * 3

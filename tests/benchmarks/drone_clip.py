@@ -72,7 +72,6 @@ def run_clip(clip: Path, out: Path, *options: str) -> tuple[Run, GeoreferenceRec
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     run = open_run(out)
     record = read_georeference(run.layout)
-    assert record is not None
     return run, record
 
 
@@ -105,7 +104,6 @@ def add_subtitles(run: Run, subtitles: Path) -> tuple[Run, GeoreferenceRecord]:
     compute_stages(plan, ("georeference", "scale"))
     again = open_run(run.layout.root)
     record = read_georeference(again.layout)
-    assert record is not None
     return again, record
 
 
@@ -139,7 +137,6 @@ def measure(
     metadata = scale_by(record, "metadata")
     assert metadata is not None, record.telemetry
     north_rad = record.north_rad  # true north; that of the grid's reference system is up to 3 degrees off it
-    assert north_rad is not None
     return found | {
         "metadata": metadata.gsd_m / true.gsd_m - 1,
         "metadata_held": float(metadata.low_m <= true.gsd_m <= metadata.high_m),

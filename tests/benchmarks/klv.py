@@ -10,21 +10,17 @@ import argparse
 
 import numpy as np
 
-from schemas.scale import ScaleEstimate
 from schemas.simulation import SimulationConfig
 from tests.misb import encode_telemetry
 from tests.sources.test_klv import true_hfov_deg
 from tests.sources.test_telemetry import simulated_poses
 from velfield.sources.telemetry.klv import parse_klv
-from velfield.sources.telemetry.placement import FramePoses, North, estimate_north, estimate_scale
-from velfield.sources.telemetry.telemetry import Telemetry
+from velfield.sources.telemetry.placement import FramePoses, estimate_north, estimate_scale
 
 
 def errors(config: SimulationConfig, poses: FramePoses) -> tuple[float, float, bool]:
     """Error of the scale, %; error of north, degrees; and whether the scale's interval holds the truth."""
     scale, north = estimate_scale(poses), estimate_north(poses)
-    assert isinstance(scale, ScaleEstimate)
-    assert isinstance(north, North)
     turned = north.direction_rad - np.radians(-90 - config.telemetry.north_deg)
     return (
         100 * (scale.gsd_m / config.gsd_m - 1),
@@ -43,7 +39,6 @@ def main() -> None:
     for seed in range(given.first, given.first + given.seeds):
         config, poses = simulated_poses(seed)
         read = parse_klv(b"".join(encode_telemetry(poses.telemetry, true_hfov_deg(seed))), "x.klv")
-        assert isinstance(read, Telemetry)
         at = read.at(poses.telemetry.time_s)
         by_klv = FramePoses(at, poses.width, poses.height, poses.centre_xy, poses.jacobian)
         found["subtitles"].append(errors(config, poses))

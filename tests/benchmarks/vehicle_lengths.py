@@ -18,7 +18,6 @@ from schemas.detector import CnnConfig
 from schemas.scale import CAR_LENGTH_M, ScaleEstimate
 from schemas.simulation import SimulationConfig
 from velfield.analysis.vehicle_scale import POPULATION_SD, TRACK_LENGTH_SD, estimate_vehicle_scale
-from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.model import measure_vehicles
 from velfield.detection.registry import shipped_detector
 from velfield.detection.scale_search import working_scale
@@ -38,7 +37,6 @@ def lengths_of(flight: Flight, gsd_m: float, rng: np.random.Generator) -> tuple[
     """Measured lengths of the vehicles of a flight and their standard deviations, base px, the working grid's scale
     being that of ``gsd_m``."""
     scale, detector = working_scale(CnnConfig(), gsd_m), shipped_detector()
-    assert isinstance(detector, CnnDetector)
     sizes, vehicles = [], []
     for frame in range(flight.config.frames):
         cars = flight.cars(frame)

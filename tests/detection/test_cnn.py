@@ -86,7 +86,6 @@ def test_the_threshold_of_few_cars_is_shrunk_towards_the_pretrained_one() -> Non
     shrunk = fine_tune([labelled], shipped(), strict, config)
     weight = len(labelled.cars) / (len(labelled.cars) + 150)
     assert shrunk.threshold - own.threshold == pytest.approx(0.1 * (1 - weight))
-    assert own.curve.operating_point is not None
     assert own.curve.threshold[own.curve.operating_point] == pytest.approx(
         own.threshold, abs=0.05
     )  # of few cars it has few points

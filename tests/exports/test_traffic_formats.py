@@ -135,7 +135,6 @@ def test_utdf_ends_greens_where_the_cycle_does_in_a_flight_of_two_clips() -> Non
     """Most starts of queues are in the second clip, against which the signal is late in the first."""
     late = in_two_clips(1013.0, 0.0, 180.0, 500.0)
     (signal,) = (s for s in late.signals.values() if s.signalised)
-    assert signal.cycle_s is not None
     rows = utdf_sections(utdf(late, height_m=100.0))["Phases"].query("INTID == @signal.junction + 1")
     phases = rows.set_index("RECORDNAME")
     for k, lanes in enumerate(signal.phases, start=1):

@@ -144,7 +144,6 @@ def test_case_24_a_place_without_a_reference_system() -> None:
 def scale_m(telemetry: Telemetry | Failure) -> float:
     count = len(telemetry.time_s)
     found = estimate_scale(FramePoses(telemetry, 640, 480, np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))))
-    assert not isinstance(found, Failure)
     return found.gsd_m
 
 

@@ -248,7 +248,6 @@ def test_a_training_shows_its_progress_and_hears_sigterm_at_once(flight: Path, t
         text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     ) as process:
-        assert process.stderr is not None
         assert any(re.match(r"training: [1-9]\d* of \d+ steps", line.strip()) for line in process.stderr)
         started = time.monotonic()
         process.send_signal(signal.SIGTERM)

@@ -86,7 +86,6 @@ def test_memory_is_that_of_the_driver_and_of_the_largest_worker() -> None:
     other = [sys.executable, "-c", hold.format(mb=400)]
     command = f"import subprocess as s; [p.wait() for p in [s.Popen({worker}), s.Popen({other})]]"
     run = run_measured([sys.executable, "-c", command], watch=Path(sys.executable))
-    assert run.appeared_s is not None
     assert run.appeared_s < run.wall_s
     assert run.wall_s > 1.5
     assert run.driver.peak_mb < 100

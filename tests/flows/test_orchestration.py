@@ -67,14 +67,12 @@ def test_tasks_read_those_before(by: Orchestration) -> None:
 
 
 def test_a_run_that_lost_frames_is_shown_as_incomplete(server: None) -> None:
-    from prefect.states import State
 
     from flows.prefect_flows import end_state
 
     stage = StageSummary(name="registration", units=2, done_before=0, lost=("1",), seconds=1.0, text="")
     summary = RunSummary(root="RUN", stages=(stage,), frames_lost=("frame 1 (0.2 s): not processed",))
     shown = end_state(summary)
-    assert isinstance(shown, State)
     assert (shown.name, shown.is_completed()) == ("Incomplete", True)
     assert str(shown.message).startswith("incomplete: frames lost: 1, units lost: 1")
     by = choose_orchestration()

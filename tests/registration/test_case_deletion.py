@@ -5,7 +5,6 @@ import pytest
 
 from velfield.errors import Failure
 from velfield.registration.fitting import (
-    CaseDeletionFit,
     fit_by_case_deletion,
     fit_polyprojective,
     second_order_monomials,
@@ -36,7 +35,6 @@ def error_px(transform: PolyprojectiveTransform) -> float:
 def test_outliers_are_deleted_and_the_truth_is_found(fraction: float) -> None:
     source, target, wrong = contaminated(fraction, 1)
     fit = fit_by_case_deletion(source, target, model="homography", max_mean_error_px=0.6)
-    assert isinstance(fit, CaseDeletionFit)
     assert not (fit.inliers & wrong).any()
     assert (fit.inliers & ~wrong).sum() > 0.8 * (~wrong).sum()
     assert error_px(fit.transform) < 0.1
@@ -55,7 +53,6 @@ def test_each_round_deletes_the_fraction_that_is_asked_for() -> None:
     rounds = {}
     for fraction in (0.02, 0.1):
         fit = fit_by_case_deletion(source, target, model="homography", drop_fraction=fraction, max_mean_error_px=0.6)
-        assert isinstance(fit, CaseDeletionFit)
         rounds[fraction] = fit.rounds
         left = 600
         for _ in range(fit.rounds):
@@ -67,7 +64,6 @@ def test_each_round_deletes_the_fraction_that_is_asked_for() -> None:
 def test_no_round_is_needed_where_all_points_agree() -> None:
     source, target, _ = contaminated(0.0, 3, noise_px=0.0)
     fit = fit_by_case_deletion(source, target, max_mean_error_px=0.5)
-    assert isinstance(fit, CaseDeletionFit)
     assert fit.rounds == 0
     assert fit.inliers.all()
 
@@ -76,7 +72,6 @@ def test_points_without_a_value_are_never_inliers() -> None:
     source, target, _ = contaminated(0.0, 4)
     source[:7], target[7:11] = np.nan, np.inf
     fit = fit_by_case_deletion(source, target, model="homography")
-    assert isinstance(fit, CaseDeletionFit)
     assert not fit.inliers[:11].any()
     assert fit.inliers[11:].all()
 
@@ -97,7 +92,6 @@ def test_the_polyprojective_holds_second_order_terms_and_the_homography_does_not
     true = PolyprojectiveTransform(coefficients, norm, norm)
     second, first = (fit_polyprojective(source, true(source), model=m) for m in ("polyprojective", "homography"))
     assert not isinstance(second, Failure)
-    assert not isinstance(first, Failure)
     assert np.abs(second(source) - true(source)).max() < 0.05
     assert np.abs(first(source) - true(source)).max() > 1.0
     assert first.is_homography

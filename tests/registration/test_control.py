@@ -136,7 +136,6 @@ def test_another_area_is_a_failure_with_the_number_of_matches(pair: ImagePair) -
 def test_the_frame_is_warped_to_where_the_base_image_shows_the_same(pair: ImagePair, fit: FineFit) -> None:
     for scale in (0.5, 1.0):
         images = warp_to_base_grid(pair, fit.transform, scale)
-        assert images is not None
         moving, mask, reference, (x0, y0) = images
         assert moving.shape == mask.shape == reference.shape
         assert 0 <= x0 < 330

@@ -68,7 +68,6 @@ def flight() -> tuple[list[np.ndarray], list[np.ndarray]]:
 def test_pairs_are_padded_by_their_first_match(flight: tuple[list[np.ndarray], list[np.ndarray]]) -> None:
     frames, views = flight
     pairs = match_frame_pairs(frames)
-    assert pairs is not None
     assert pairs.frame_shape == SHAPE
     assert pairs.valid.shape == pairs.xy_i.shape[:2] == pairs.xy_j.shape[:2]
     assert pairs.valid.any(axis=0).all()  # no column of padding alone
@@ -85,8 +84,6 @@ def test_matches_survive_a_lens_not_yet_known(flight: tuple[list[np.ndarray], li
     frames, views = flight
     found = match_frame_pairs([photograph(ground, view, lens, SHAPE, k) for k, view in enumerate(views)])
     straight = match_frame_pairs(frames)
-    assert found is not None
-    assert straight is not None
     assert found.valid.sum() > 0.8 * straight.valid.sum()
     for p, (i, j) in enumerate(found.frames):
         ends = [lens.undistort_points(xy[p][found.valid[p]]) for xy in (found.xy_i, found.xy_j)]

@@ -160,7 +160,6 @@ def test_north_in_the_image_is_where_a_step_along_the_meridian_leads(angle_deg: 
         width_px=9, height_px=9, base_source="given", reference_frame=0, crs_wkt=zone.to_wkt(), affine=tuple(affine)[:6]
     )
     direction = north_direction_rad(grid)
-    assert direction is not None
     step = np.array([np.cos(direction), np.sin(direction)])
     xs, ys = zip(*(affine @ (4.5 + far * step[0], 4.5 + far * step[1]) for far in (0.0, 4000.0)), strict=True)
     longitude, latitude = to_system(zone, CRS.from_epsg(4326), xs, ys)

@@ -53,7 +53,6 @@ def test_scale_north_and_place_by_klv(seed: int, written: object, tmp_path: Path
     _, poses = simulated_poses(seed)
     packets = encode_telemetry(poses.telemetry, true_hfov_deg(seed))
     found = written(packets, tmp_path)
-    assert isinstance(found, Telemetry)
     truth = poses.telemetry
     expected_s = np.arange(len(packets)) / 25 if written is in_transport_stream else truth.time_s
     assert found.time_s == pytest.approx(expected_s, abs=2e-3)  # the clock of the subtitles is in milliseconds
@@ -65,8 +64,6 @@ def test_scale_north_and_place_by_klv(seed: int, written: object, tmp_path: Path
     by_klv = FramePoses(replace(found, time_s=truth.time_s), poses.width, poses.height, poses.centre_xy, poses.jacobian)
     config, _ = simulated_poses(seed)
     scale, north = estimate_scale(by_klv), estimate_north(by_klv)
-    assert not isinstance(scale, Failure)
-    assert not isinstance(north, Failure)
     assert scale.gsd_m == pytest.approx(config.gsd_m, rel=0.03)
     assert scale.low_m < config.gsd_m < scale.high_m
     assert "above the ground" in scale.note
@@ -91,7 +88,6 @@ def test_scale_north_and_place_by_klv(seed: int, written: object, tmp_path: Path
 def test_height_above_the_ground(change: dict[int, float | None], height_m: float) -> None:
     tags = {tag: value for tag, value in (NADIR | change).items() if value is not None}
     found = parse_klv(encode_set(tags), "x.klv")
-    assert isinstance(found, Telemetry)
     assert found.height_m == pytest.approx([height_m], abs=0.35, nan_ok=True)
 
 
@@ -99,7 +95,6 @@ def test_the_vertical_angle_of_view_serves_where_it_is_alone() -> None:
     _, poses = simulated_poses(111)
     for tags in (NADIR, {tag: value for tag, value in NADIR.items() if tag != 16} | {17: 30.5}):
         found = parse_klv(encode_set(tags), "x.klv")
-        assert isinstance(found, Telemetry)
         still = found.at(np.zeros(len(poses.centre_xy)))
         focal = FramePoses(still, 640, 480, poses.centre_xy, poses.jacobian).focal_px
         expected = 320 / np.tan(np.radians(20)) if 16 in tags else 240 / np.tan(np.radians(15.25))
@@ -110,7 +105,6 @@ def test_sets_with_a_wrong_checksum_are_left_out_and_told() -> None:
     good, bad = encode_set(NADIR), bytearray(encode_set(NADIR | {2: 1.7e9 + 1, 13: 10.0}))
     bad[60] ^= 1
     found = parse_klv(good + b"noise" + bytes(bad) + encode_set(NADIR | {2: 1.7e9 + 2}), "x.klv")
-    assert isinstance(found, Telemetry)
     assert found.time_s.tolist() == [0.0, 2.0]
     assert found.latitude_deg == pytest.approx([52.5, 52.5])
     assert found.notes == ("1 of 3 sets of x.klv have a wrong checksum: left out",)
@@ -122,7 +116,6 @@ def test_sets_with_a_wrong_checksum_are_left_out_and_told() -> None:
 def test_values_marked_as_errors_are_not_known() -> None:
     plain = {tag: value for tag, value in NADIR.items() if tag != 13}
     found = parse_klv(encode_set(plain, extra=b"\x0d\x04\x80\x00\x00\x00"), "x.klv")
-    assert isinstance(found, Telemetry)
     assert np.isnan(found.latitude_deg).all()
     assert found.height_m == pytest.approx([500.0], abs=0.35)
 
@@ -130,14 +123,12 @@ def test_values_marked_as_errors_are_not_known() -> None:
 def test_a_set_cut_by_the_transport_is_put_together(tmp_path: Path) -> None:
     packet = encode_set(NADIR)
     found = in_transport_stream([packet[:40], packet[40:], b"\0", packet, b"\0"], tmp_path)
-    assert isinstance(found, Telemetry)
     assert found.time_s == pytest.approx([0.0, 0.12], abs=1e-3)
 
 
 def test_the_clock_of_klv_is_utc(tmp_path: Path) -> None:
     path = write_transport_stream(tmp_path / "x.ts", [encode_set(NADIR | {2: 1.7e9 + k / 25}) for k in range(5)])
     start = read_flight_start(path, probe(path, frames=FramesConfig()))
-    assert start is not None
     assert (start.is_utc, start.source) == (True, "MISB KLV of x.ts")
     assert start.clock_s == pytest.approx(1.7e9, abs=1e-3)
 

@@ -33,7 +33,6 @@ def test_disagreement_is_reported_where_intervals_do_not_meet() -> None:
 def test_lengths_of_vehicles_overrule_metadata_that_cannot_be_alone(metadata_m: float, used: str) -> None:
     vehicles, metadata = estimate(0.1, "vehicles", 0.08), estimate(metadata_m, "metadata")
     choice = choose_scale([metadata, vehicles])
-    assert choice.used is not None
     assert choice.used.source == used
     assert len(choice.disagreements) == (metadata_m != 0.105)
     assert choose_scale([metadata, vehicles, estimate(0.1, "given")]).used == estimate(0.1, "given")

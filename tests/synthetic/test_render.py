@@ -303,7 +303,6 @@ def test_parked_cars_are_drawn_and_cast_shadows_in_the_sun() -> None:
 @pytest.mark.parametrize("angle", [0.0, 0.7, np.pi / 2])
 def test_the_motion_kernel_is_normalised_and_along_its_direction(angle: float) -> None:
     kernel = _motion_kernel(1.5, angle)
-    assert kernel is not None
     assert kernel.sum() == pytest.approx(1.0, abs=1e-5)
     y, x = np.mgrid[-3:4, -3:4]
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)

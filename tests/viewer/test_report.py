@@ -251,7 +251,6 @@ def test_a_long_flight_keeps_its_peaks() -> None:
 
 def test_plots_are_the_same_bytes_whenever_they_are_drawn() -> None:
     curve = made_report()[0].detection
-    assert curve is not None
     assert precision_recall_plot(curve) == precision_recall_plot(curve)
     assert b"chosen: precision 0.80, recall 0.90" in precision_recall_plot(curve)
 
