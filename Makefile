@@ -78,7 +78,7 @@ format: $(STAMP)
 bench: $(STAMP)  ## speed, as ratios against a peer in the same run
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps stabilo==1.4.7
 	$(BIN)/uv pip install --quiet --python $(BIN)/python trackpy boost-histogram xhistogram
-	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
+	$(BIN)/velfield bench speed
 
 # Of the lock, in an environment of the tool's own. Strict: a package that the service does not know fails the audit.
 audit: $(STAMP)  ## known vulnerabilities of the pinned packages, by pip-audit, which asks PyPI or OSV

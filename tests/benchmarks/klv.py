@@ -46,8 +46,8 @@ def main() -> None:
     for name, rows in found.items():
         scale, north, held = (np.array(column, float) for column in zip(*rows, strict=True))
         print(
-            f"{name}: scale RMS {np.sqrt(np.mean(scale**2)):.1f} %, at most {np.abs(scale).max():.1f} %; north RMS "
-            f"{np.sqrt(np.mean(north**2)):.1f}°, at most {np.abs(north).max():.1f}°; "
+            f"{name}: scale RMS {np.sqrt(np.mean(scale**2)):.2f} %, at most {np.abs(scale).max():.2f} %; north RMS "
+            f"{np.sqrt(np.mean(north**2)):.2f}°, at most {np.abs(north).max():.2f}°; "
             f"interval held {held.sum():.0f} of {len(rows)}"
         )
 
