@@ -1,4 +1,4 @@
-"""Clusters: by configuration alone, with a worker killed in mid-chunk, and with workers that have no `flows`."""
+"""Clusters: by configuration alone, and with a worker killed in mid-chunk; workers without `flows`: `test_s3`."""
 
 import os
 import shutil
@@ -27,12 +27,9 @@ from flows.runners import (
     read_runner,
 )
 from tests.faults.test_refusals import command
-from tests.foreign_cluster import foreign_cluster
 from tests.small_flight import digests, job, process
 from velfield.errors import InputError
 from velfield.pipeline.stage import STAGES
-from velfield.run.layout import RunLayout
-from velfield.run.results import link_shared_outputs
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("cluster-*.yaml"))
@@ -204,17 +201,6 @@ def test_a_unit_over_the_memory_limit_is_tried_once_more_and_then_left_out_with_
     (copy / "attempts").unlink()
     assert process(job(flight, copy)).complete
     assert digests(copy) == digests(whole)
-
-
-def test_workers_elsewhere_without_flows_give_the_same(
-    whole: Path, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All but lens, base image and detector is done there; the run folder is given by a path from where we stand."""
-    monkeypatch.chdir(tmp_path)
-    link_shared_outputs(RunLayout(whole), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
-    with foreign_cluster(tmp_path) as address:
-        process(job(flight, Path("run")), RunnerConfig(scheduler=address))
-    assert digests(tmp_path / "run") == digests(whole)
 
 
 def test_a_cluster_without_workers_is_said_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

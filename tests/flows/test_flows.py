@@ -225,14 +225,6 @@ def test_a_scale_at_which_no_car_can_be_seen_is_refused(copy: Path, flight: Path
         process(work.model_copy(update={"config": work.config.model_copy(update={"gsd_m": 2.3})}))
 
 
-def test_commit_records_hold_counts_and_digests(whole: Path) -> None:
-    record = json.loads((whole / "commits" / "detections" / "000008-000015.json").read_text())
-    assert record["counts"]["frames"] == 8
-    sure = pd.concat(pd.read_parquet(path) for path in whole.glob("detections/unit-*.parquet"))
-    assert record["counts"]["cars"] == int(sure["frame"].between(8, 15).sum())
-    assert all(digest for name, digest in record["outputs"].items() if name.endswith(".parquet"))
-
-
 def true_boxes(flight: Path) -> pd.DataFrame:
     """Places of the visible cars within the frames, raw px, as another detector gives them."""
     from velfield.synthetic.truth import load_truth

@@ -33,6 +33,7 @@ from flows.serve import ServeConfig, check, deployments, settings, watching
 from schemas.job import Job
 from schemas.summary import RunSummary
 from tests.browser import browser
+from tests.faults.test_servers import listening
 from velfield.errors import InputError
 from velfield.pipeline.plan import OtherFlightError
 from velfield.pipeline.stage import STAGES, NewBase
@@ -166,6 +167,8 @@ def test_all_addresses_with_a_password(tmp_path: Path) -> None:
                 if password is not None:
                     request.add_header("Authorization", f"Basic {b64encode(password.encode()).decode()}")
                 assert _status(request) == status
+            for path in ("/admin/version", "/variables/name/system-health"):
+                assert _status(urllib.request.Request(f"{url}/api{path}")) == 401, path
             with browser(tmp_path / "profile") as found, found.page() as page:
                 page.open(url)
                 page.wait("document.querySelector('input') !== null")  # for the password
@@ -381,10 +384,6 @@ def wait_for(what: Callable[[], bool], seconds: float = 180) -> None:
         time.sleep(0.5)
 
 
-def sockets_of(process: psutil.Process) -> set[str]:
-    return {found.laddr.ip for found in process.net_connections(kind="tcp") if found.status == psutil.CONN_LISTEN}
-
-
 def test_from_the_event_to_the_finished_reprocess(served: Served, flight: Path) -> None:
     image = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
     # Hidden names are not watched, so that only the event announces it.
@@ -500,7 +499,7 @@ def test_sockets_and_origins_and_that_ctrl_c_leaves_nothing(served: Served) -> N
     """Last of all."""
     serving = psutil.Process(served.process.pid)
     family = [serving, *serving.children(recursive=True)]
-    assert set().union(*(sockets_of(process) for process in family)) <= {"127.0.0.1"}
+    assert {address for _, address, _ in listening(*family)} <= {"127.0.0.1"}
     request = urllib.request.Request(f"{served.url}/api/health", headers={"Origin": "http://evil.example"})
     with urllib.request.urlopen(request, timeout=30) as answer:
         assert answer.headers["access-control-allow-origin"] not in ("*", "http://evil.example")

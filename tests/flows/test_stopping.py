@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
@@ -39,19 +38,3 @@ def test_what_a_process_started_ends_with_it(kill: bool) -> None:
                 assert bystander.poll() is None
             finally:
                 bystander.kill()
-
-
-def test_ctrl_c_is_answered(tmp_path: Path) -> None:
-    flight = str(tmp_path / "flight")
-    command = [sys.executable, "-m", "flows.cli", "simulate", flight, "--frames", "500", "--size", "640x480"]
-    checkout = str(Path(__file__).parents[2])
-    with subprocess.Popen(
-        command, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": checkout}, text=True
-    ) as process:
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.glob("flight/frames/*")) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        _, text = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert text.strip().splitlines()[-1] == "velfield: stopped"

@@ -157,6 +157,16 @@ def test_a_plan_is_small(tmp_path: Path) -> None:
     assert small < 20_000
 
 
+def test_paths_of_a_plan_mean_the_same_to_workers_in_other_folders(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(flight)
+    sent = make_plan(job(Path(), Path("run"))).job
+    paths = [sent.root, *filter(None, sent.inputs.model_dump().values())]
+    assert len(paths) == 5
+    assert [path for path in paths if not path.startswith(str(flight))] == []
+
+
 @pytest.mark.parametrize("frames", [300, FOUR_HOURS])
 def test_the_estimate_of_bytes_is_of_the_order_of_what_was_measured(tmp_path: Path, frames: int) -> None:
     """354 GB are four hours of raw frames of that size; Zstandard leaves 0.6 to 0.8 of them."""
