@@ -7,7 +7,6 @@ import pytest
 
 from schemas.arrays import FloatArray
 from tests.field_runs import field_run, tracklets_along
-from velfield.run.frame_transforms import heading_deg
 from velfield.run.run import Run
 
 GSD_M = 0.25
@@ -65,11 +64,3 @@ def test_the_bottleneck_begins_where_traffic_slows_down(run: Run) -> None:
     row = found.table.set_index("region").loc[found.labels[40, int(np.median(eastbound))]]
     assert row.ratio == pytest.approx(1 / 3, abs=0.05)
     assert row.upstream_speed_px_per_s * GSD_M == pytest.approx(12.0, abs=0.5)
-
-
-@pytest.mark.parametrize(
-    ("direction", "north", "heading"),
-    [(-np.pi / 2, None, 0.0), (0.0, None, 90.0), (np.pi, None, 270.0), (0.0, 0.0, 0.0), (np.pi / 2, np.pi, 270.0)],
-)
-def test_headings_are_clockwise_from_north(direction: float, north: float | None, heading: float) -> None:
-    assert heading_deg(np.array([direction]), north)[0] == pytest.approx(heading)

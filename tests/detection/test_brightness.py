@@ -5,10 +5,10 @@ import pytest
 
 from schemas.arrays import GreyImage
 from schemas.detector import CnnConfig
-from tests.detection.test_quantization import shipped
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.brightness import USUAL_MEDIAN, brighten, gamma_of
 from velfield.detection.evaluation import f_measure, match_labels
+from velfield.detection.registry import shipped_detector
 from velfield.detection.samples import LabelledImage
 
 
@@ -17,7 +17,7 @@ def underexposed(image: GreyImage, factor: float) -> GreyImage:
 
 
 def f1(image: GreyImage, sample: LabelledImage) -> float:
-    found = shipped().detect(image)
+    found = shipped_detector().detect(image)
     right, counted = match_labels(found.xy[np.argsort(-found.score)], sample.cars, sample.ignore)
     return f_measure(right[counted].mean(), right[counted].sum() / len(sample.cars))
 
@@ -45,6 +45,6 @@ def test_an_underexposed_city_is_seen_as_well() -> None:
 def test_a_flight_has_one_exponent() -> None:
     """That of all its images, not of a part of a frame, in the file that the run keeps."""
     dark, bright = np.full((64, 64), 50, np.uint8), np.full((64, 64), 230, np.uint8)
-    record = shipped().in_light_of([dark, dark, bright]).for_flight([bright], CnnConfig()).record
+    record = shipped_detector().in_light_of([dark, dark, bright]).for_flight([bright], CnnConfig()).record
     assert record.gamma == gamma_of(dark)
-    assert shipped().record.gamma is None
+    assert shipped_detector().record.gamma is None

@@ -37,14 +37,6 @@ def test_images_of_any_size_are_processed(shape: tuple[int, int]) -> None:
     assert detect_cars(Predictor(shipped()), image, None).shape[1] == 9
 
 
-def test_a_network_survives_its_record_at_half_precision() -> None:
-    network = Trainer.from_network(shipped()).network()
-    again = network_from_record(network_to_record(network))
-    for name in network.weights:
-        np.testing.assert_allclose(again.weights[name], network.weights[name], rtol=1e-3, atol=1e-6)
-        np.testing.assert_allclose(again.biases[name], network.biases[name], rtol=1e-3, atol=1e-6)
-
-
 def test_fine_tuning_is_deterministic_and_keeps_the_attribution() -> None:
     few = replace(city(9504), cars=city(9504).cars[:12], complete=False)
     config = CnnConfig(fine_tune_steps=5)

@@ -7,10 +7,8 @@ import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
-from velfield.detection.cnn.dataset import encode_targets
 from velfield.detection.cnn.inference import Predictor
 from velfield.detection.cnn.model import (
-    SCORE_OFFSET,
     SMOOTHING_SIGMA,
     detect_cars,
     find_peaks,
@@ -50,18 +48,6 @@ def nearest(found: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatA
     return gap.min(axis=1), axial_difference(found[gap.argmin(axis=1), 2], expected[:, 2])
 
 
-def test_positions_and_orientations_are_decoded_from_a_heatmap() -> None:
-    centres = np.array([[20.3, 30.9], [60.0, 22.2], [40.7, 70.1], [75.4, 60.6]])
-    angles = np.array([0.2, 1.1, 2.0, 2.9])
-    heatmap, orientation, _ = encode_targets(centres, angles)
-    found = find_peaks(heatmap, orientation.transpose(2, 0, 1), None, stride=2, min_probability=0.2)
-    assert len(found) == 4
-    axes = 0.5 * np.arctan2(found[:, 3], found[:, 2])
-    distance, difference = nearest(np.column_stack([found[:, :2], axes]), np.column_stack([centres, angles]))
-    assert distance.max() < 0.15
-    assert difference.max() < 1e-3
-
-
 def test_detections_shift_with_the_image() -> None:
     """Of two crops, where both see as far as the network does."""
     image = simulated_image(9503).image
@@ -83,26 +69,6 @@ def test_detections_rotate_with_the_image() -> None:
     assert np.median(distance) < 1.0
     assert np.median(difference) < np.radians(3)
     assert (distance < 4).mean() > 0.85
-
-
-def test_nothing_is_detected_where_the_frame_is_not_valid() -> None:
-    valid = np.zeros(scene().shape, bool)
-    valid[:, :80] = True
-    left, expected = detect_cars(network(), scene(), valid), scene_detections()
-    assert len(left)
-    assert (left[:, 0] < 80).all()
-    expected = expected[expected[:, 0] < 70]
-    assert len(expected)
-    assert nearest(left, expected)[0].max() < 0.1
-    assert len(detect_cars(network(), scene(), np.zeros_like(valid))) == 0
-
-
-def test_scores_are_probabilities_less_the_offset() -> None:
-    found = scene_detections()
-    assert (found[:, 3] > -SCORE_OFFSET).all()
-    assert (found[:, 3] < 1 - SCORE_OFFSET).all()
-    assert ((found[:, 2] >= 0) & (found[:, 2] < np.pi)).all()
-    assert (found[:, 4] > 0).all()
 
 
 def test_a_car_truncated_by_the_frame_is_not_detected() -> None:

@@ -18,7 +18,6 @@ from schemas.detector import CnnConfig
 from schemas.flight import Device
 from tests.detection.test_onnx import tiny_yolo
 from velfield.detection import runtime as sessions
-from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.graph import network_to_onnx
 from velfield.detection.cnn.inference import Predictor, predict_crops, predict_heatmap
 from velfield.detection.registry import shipped_detector
@@ -99,14 +98,8 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Runtime]:
         cache.cache_clear()
 
 
-def shipped() -> CnnDetector:
-    detector = shipped_detector()
-    assert isinstance(detector, CnnDetector)
-    return detector
-
-
 def in_floating_point() -> Predictor:
-    return Predictor(shipped().network)
+    return Predictor(shipped_detector().network)
 
 
 def image(seed: int = 0) -> GreyImage:
@@ -116,7 +109,7 @@ def image(seed: int = 0) -> GreyImage:
 @pytest.mark.parametrize(("device", "gpu"), [("auto", True), ("cuda", True), ("cpu", False)])
 def test_a_gpu_runs_the_network_where_there_is_one_and_it_may(runtime: Runtime, device: Device, gpu: bool) -> None:
     sessions.check_device(device)
-    session = sessions.open_session(network_to_onnx(shipped().network), device)
+    session = sessions.open_session(network_to_onnx(shipped_detector().network), device)
     assert (CUDA in session.get_providers()) == gpu == sessions.uses_cuda(device)
     assert runtime.asked[-1][-1] == CPU
     assert sessions.device_limitations(device) == []
@@ -136,7 +129,7 @@ def test_on_a_gpu_all_runs_in_floating_point_on_images_of_one_size(
     runtime: Runtime, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the ranges of a flight too, by which it would be run in 8 bits on a processor."""
-    detector = shipped().for_flight([image()], CnnConfig())
+    detector = shipped_detector().for_flight([image()], CnnConfig())
     predict, sizes = detector.predictor, set()
     assert sessions.on_cuda(predict.session)
     assert detector.limitations == []
@@ -172,7 +165,7 @@ def test_cuda_that_does_not_start_is_told_once_and_the_processor_runs_8_bits(
     runtime: Runtime, fault: dict[str, Any], why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vars(runtime).update(fault)
-    detector = shipped().for_flight([image()], CnnConfig())
+    detector = shipped_detector().for_flight([image()], CnnConfig())
     with pytest.warns(DeviceWarning) as told:
         found = detector.predictor(image()[None])
     assert len(told) == 1
@@ -184,7 +177,7 @@ def test_cuda_that_does_not_start_is_told_once_and_the_processor_runs_8_bits(
     assert not sessions.on_cuda(detector.predictor.session)
     assert message in detector.limitations
     sessions.use_device("cpu")
-    again = shipped().for_flight([image()], CnnConfig())
+    again = shipped_detector().for_flight([image()], CnnConfig())
     np.testing.assert_array_equal(found[0], again.predictor(image()[None])[0])
     with pytest.raises(InputError, match="--device cuda: found onnxruntime with CUDA that does not start") as refused:
         sessions.check_device("cuda")
@@ -213,7 +206,7 @@ def test_an_onnxruntime_that_preloads_nothing_is_tried_as_it_is(
 
 
 def test_a_session_that_a_full_gpu_refuses_is_no_silent_fallback(runtime: Runtime) -> None:
-    model = network_to_onnx(shipped().network)
+    model = network_to_onnx(shipped_detector().network)
     assert sessions.uses_cuda("auto")
     runtime.starts = False
     with pytest.warns(DeviceWarning, match="GPU unavailable, no further session starts on it: using the CPU"):
@@ -226,14 +219,14 @@ def test_a_session_that_a_full_gpu_refuses_is_no_silent_fallback(runtime: Runtim
 def test_on_a_full_gpu_all_runs_in_8_bits_on_the_processor(
     runtime: Runtime, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    detector = shipped().for_flight([image()], CnnConfig())
+    detector = shipped_detector().for_flight([image()], CnnConfig())
     runtime.most = len(runtime.asked) + 1  # the probe
     with pytest.warns(DeviceWarning, match="no further session starts"):
         found = detector.predictor(image()[None])
     assert not sessions.on_cuda(detector.predictor.session)
     assert capsys.readouterr().out == ""
     sessions.use_device("cpu")
-    again = shipped().for_flight([image()], CnnConfig())
+    again = shipped_detector().for_flight([image()], CnnConfig())
     np.testing.assert_array_equal(found[0], again.predictor(image()[None])[0])
 
 
@@ -260,12 +253,12 @@ def test_what_a_stage_says_is_not_warned_of_too(runtime: Runtime, tmp_path: Path
         detector = given_files._read_detector(tiny_yolo(tmp_path / "m.onnx", "boxes"), plan)
         in_floating_point()(image()[None])
     assert len(detector.limitations) == 1
-    assert detector.limitations == shipped().limitations
+    assert detector.limitations == shipped_detector().limitations
 
 
 def test_cuda_that_every_worker_must_have_is_refused_without_it(runtime: Runtime) -> None:
     """In 8 bits too."""
-    detector = shipped().for_flight([image()], CnnConfig())
+    detector = shipped_detector().for_flight([image()], CnnConfig())
     runtime.offered = [CPU]
     sessions.use_device("cuda")
     with pytest.raises(InputError, match="--device cuda"):

@@ -7,7 +7,6 @@ from schemas.arrays import GreyImage
 from schemas.detector import CnnConfig
 from tests.detection.test_cnn_layers import random_network
 from velfield.detection import runtime
-from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.graph import network_to_onnx
 from velfield.detection.cnn.inference import Predictor, predict_crops
 from velfield.detection.cnn.quantization import INEXACT, calibrate, quantized_to_onnx
@@ -24,15 +23,9 @@ def cars(seed: int = 0, shape: tuple[int, int] = (208, 304)) -> GreyImage:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def shipped() -> CnnDetector:
-    detector = shipped_detector()
-    assert isinstance(detector, CnnDetector)
-    return detector
-
-
 @pytest.mark.usefixtures("exact")
 def test_eight_bits_give_nearly_the_heatmap_of_floating_point() -> None:
-    network, image = shipped().network, cars()[None]
+    network, image = shipped_detector().network, cars()[None]
     wanted, axes, sizes = Predictor(network)(image)
     found, found_axes, found_sizes = Predictor(network, calibrate(network, [cars(1), cars(2)]))(image)
     at = wanted > 0.2
@@ -55,7 +48,7 @@ def test_a_network_of_random_weights_is_near_to_floating_point() -> None:
 
 @pytest.mark.usefixtures("exact")
 def test_a_crop_gives_the_same_alone_and_among_others() -> None:
-    network = shipped().network
+    network = shipped_detector().network
     predict = Predictor(network, calibrate(network, [cars(1)], crops=16))
     images = np.stack([cars(k, (96, 96)) for k in range(5)])
     np.testing.assert_array_equal(predict(images)[0], np.concatenate([predict(one[None])[0] for one in images]))
@@ -63,7 +56,7 @@ def test_a_crop_gives_the_same_alone_and_among_others() -> None:
 
 def test_of_long_crops_of_one_size_each_is_predicted() -> None:
     """They are longer than a tile, and several would fit into a batch."""
-    network = shipped().predictor
+    network = shipped_detector().predictor
     image = np.random.default_rng(4).integers(0, 256, (64, 2112), dtype=np.uint8)
     crops = np.array([(0, 0, 24, 2056), (32, 16, 24, 2056)])
     together = predict_crops(network, image, crops)
@@ -78,7 +71,7 @@ def test_of_long_crops_of_one_size_each_is_predicted() -> None:
 
 
 def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
-    network, image = shipped().predictor, cars(2, (120, 160))
+    network, image = shipped_detector().predictor, cars(2, (120, 160))
     crops = np.array([(0, 0, 48, 32), (0, 32, 48, 32), (48, 8, 64, 112), (0, 80, 48, 48)])
     probability, orientation = np.zeros((60, 80), np.float32), np.zeros((2, 60, 80), np.float32)
     sizes = np.zeros((4, 30, 40), np.float32)
@@ -95,7 +88,7 @@ def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
 
 
 def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tmp_path) -> None:
-    detector = shipped()
+    detector = shipped_detector()
     eight = detector.for_flight([cars(1)], CnnConfig())
     again = detector.for_flight([cars(1)], CnnConfig())
     assert eight.record.activation_ranges == again.record.activation_ranges
@@ -107,7 +100,7 @@ def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tm
 
 
 def test_small_images_are_calibrated_on_smaller_crops_and_smaller_ones_refused() -> None:
-    network = shipped().network
+    network = shipped_detector().network
     assert calibrate(network, [cars(1, (60, 90))], crops=4)
     with pytest.raises(ValueError, match="expected 96 or more"):
         calibrate(network, [np.zeros((4, 90), np.uint8)], crops=4)
@@ -117,14 +110,14 @@ def test_a_processor_that_saturates_takes_floating_point_and_says_so(monkeypatch
     for module in ("detector", "inference"):
         monkeypatch.setattr(f"velfield.detection.cnn.{module}.is_exact", lambda: False)
     monkeypatch.setattr(runtime, "_limitations_reported", False)
-    detector = shipped().for_flight([cars(1)], CnnConfig())
+    detector = shipped_detector().for_flight([cars(1)], CnnConfig())
     assert (detector.notes, detector.limitations) == ([INEXACT], [])
     with pytest.warns(RuntimeWarning, match="VNNI"):
         found, *_ = detector.predictor(cars()[None])
-    np.testing.assert_array_equal(found, shipped().predictor(cars()[None])[0])
+    np.testing.assert_array_equal(found, shipped_detector().predictor(cars()[None])[0])
 
 
 def test_the_model_holds_bytes() -> None:
-    network = shipped().network
+    network = shipped_detector().network
     model = quantized_to_onnx(network, calibrate(network, [cars(1)], crops=4))
     assert len(model) < len(network_to_onnx(network))

@@ -162,10 +162,6 @@ def test_west_concord(footage: Callable[[str], Path], negative: bool) -> None:
     assert result.scale == pytest.approx(0.915, abs=0.012)
     assert np.degrees(result.rotation_rad) == pytest.approx(10.3, abs=0.5)
     assert result.cv_error_px < 1.0
-    flipped = register_intersensor(
-        np.ascontiguousarray(shown[:, ::-1]), base, CONFIG, lens=pinhole((image.shape[0], image.shape[1]))
-    )
-    assert isinstance(flipped, Failure)
 
 
 def town(seed: int, block_px: int = 110) -> np.ndarray:

@@ -77,14 +77,6 @@ def test_wobble_moves_rows_by_its_amplitude_and_cycles() -> None:
     assert np.ptp(moved) == pytest.approx(8.0, abs=0.7)
 
 
-def test_vibration_is_within_its_band() -> None:
-    camera = small_flight(frames=2, camera=CameraSimulation(vibration_px=2.0)).camera
-    hz = camera.shake.omega_rad_per_s / (2 * np.pi)
-    assert hz.min() >= 14
-    assert hz.max() <= 29
-    assert np.abs(camera.shake(np.linspace(0, 60, 20_000))).max() <= 2.0
-
-
 def test_relief_shifts_points_away_from_the_nadir() -> None:
     flat, hilly = (
         small_flight(frames=1, camera=PINHOLE, scene=FLAT.model_copy(update={"relief_m": h})) for h in (0.0, 2.0)

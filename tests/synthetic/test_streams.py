@@ -98,6 +98,8 @@ def test_vibration_is_a_sine_of_its_cycles_a_readout_or_within_its_band() -> Non
     assert value[:, 0] == pytest.approx(value[:, -1], abs=1e-6)
     band = shake_waves(CameraSimulation(vibration_px=2.0), np.random.default_rng(0))
     assert band.amplitude.sum(axis=1) == pytest.approx([2.0, 2.0])
+    hz = band.omega_rad_per_s / (2 * np.pi)
+    assert 14 <= hz.min() <= hz.max() <= 29
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.5])
