@@ -1,7 +1,10 @@
 """Promises of pyproject: the extras that pages and messages name, and a lock that holds them all."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 import tarfile
 import tomllib
 import zipfile
@@ -84,15 +87,22 @@ def test_the_lock_names_no_registry() -> None:
     assert re.findall(r"^.*(?:--index-url|--find-links|--extra-index-url|://).*$", LOCK, re.M) == []
 
 
-def test_the_wheel_holds_what_runs_and_nothing_else(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built from this checkout, whose page `make page` has built: without network."""
-    (built,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
-    assert Path(built).stat().st_size < 3_000_000
-    with zipfile.ZipFile(built) as wheel:
-        names = set(wheel.namelist())
-    page = {f"velfield/report/page/{name}" for name in ("viewer.html", "viewer.js", "viewer.css", "LICENSES.txt")}
+    (built,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path_factory.mktemp("wheel")), versions=["standard"])
+    return Path(built)
+
+
+PAGE = ("viewer.html", "viewer.js", "viewer.css", "annotate.js", "georeference.js", "LICENSES.txt")
+
+
+def test_the_wheel_holds_what_runs_and_nothing_else(wheel: Path) -> None:
+    assert wheel.stat().st_size < 3_000_000
+    names = set(zipfile.ZipFile(wheel).namelist())
+    page = {f"velfield/report/page/{name}" for name in PAGE} | {"velfield/report/report.css"}
     licences = f"velfield-{PROJECT['version']}.dist-info/licenses"
-    expected = page | {"velfield/detection/shipped_detector.json", "velfield/py.typed", "flows/cli.py"}
+    expected = page | {"velfield/detection/shipped_detector.json", "velfield/py.typed", "schemas/py.typed"}
     assert expected | {f"{licences}/{name}" for name in PROJECT["license-files"]} <= names
     sources = {
         str(path.relative_to(ROOT)) for room in ("flows", "velfield", "schemas") for path in (ROOT / room).rglob("*.py")
@@ -104,6 +114,22 @@ def test_the_wheel_holds_what_runs_and_nothing_else(tmp_path: Path) -> None:
         "schemas",
         f"velfield-{PROJECT['version']}.dist-info",
     }
+
+
+def test_the_wheel_runs_from_a_folder_with_decoys(wheel: Path, tmp_path: Path) -> None:
+    site, decoys = tmp_path / "site", tmp_path / "decoys"
+    zipfile.ZipFile(wheel).extractall(site)
+    for name in ("flows", "velfield", "schemas"):
+        (decoys / name).mkdir(parents=True)
+        (decoys / name / "__init__.py").write_text("raise RuntimeError('a decoy was imported')")
+    for name in ("types.py", "utils.py", "stores.py", "logging.py"):
+        (decoys / name).write_text("raise RuntimeError('a decoy was imported')")
+    code = "import flows.cli, velfield, schemas; print(flows.cli.__file__); flows.cli.app(['--version'])"
+    environment = {**os.environ, "PYTHONPATH": str(site), "PYTHONSAFEPATH": "1"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=decoys, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(str(site))
 
 
 def test_the_source_distribution_holds_what_its_tests_read(tmp_path: Path) -> None:

@@ -1,10 +1,9 @@
-"""The command: exit statuses, one clear line for bad input; the wheel among decoys."""
+"""The command: exit statuses, one clear line for bad input."""
 
 import json
 import os
 import subprocess
 import sys
-import zipfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -74,45 +73,6 @@ def test_a_plan_is_shown_and_nothing_is_done(tmp_path: Path, capsys: pytest.Capt
     assert "40 of them to process" in text
     assert "GB needed" in text
     assert not (tmp_path / "run").exists()
-
-
-@pytest.fixture(scope="module")
-def wheel_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built wheel, unpacked where nothing else is."""
-    place = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(place), str(ROOT)]
-    subprocess.run(command, check=True, capture_output=True)
-    (wheel,) = place.glob("*.whl")
-    zipfile.ZipFile(wheel).extractall(place / "site")
-    return place / "site"
-
-
-def test_the_wheel_runs_from_a_folder_with_decoys(wheel_folder: Path, tmp_path: Path) -> None:
-    for name in ("flows", "velfield", "schemas"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('a decoy was imported')")
-    for name in ("types.py", "utils.py", "stores.py", "logging.py"):
-        (tmp_path / name).write_text("raise RuntimeError('a decoy was imported')")
-    code = "import flows.cli, velfield, schemas, sys; print(flows.cli.__file__); flows.cli.app(['--version'])"
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(wheel_folder), "PYTHONSAFEPATH": "1"},
-    )
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith(str(wheel_folder))
-
-
-def test_the_wheel_ships_what_it_reads_at_run_time(wheel_folder: Path) -> None:
-    wanted = ("velfield/report/report.css", "velfield/py.typed", "schemas/py.typed", "flows/cli.py")
-    wanted += tuple(
-        f"velfield/report/page/{name}"
-        for name in ("viewer.js", "viewer.html", "annotate.js", "georeference.js", "LICENSES.txt")
-    )
-    assert [name for name in wanted if not (wheel_folder / name).exists()] == []
 
 
 def test_no_file_names_a_registry_host() -> None:
