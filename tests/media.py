@@ -38,15 +38,20 @@ def write_video(
     key_interval: int = 12,
     options: dict[str, str] | None = None,
     container_options: dict[str, str] | None = None,
+    metadata: dict[str, str] | None = None,
+    rotation_deg: int = 0,
 ) -> Path:
     """Encode grey frames; `times` are presentation times in `time_base`, else 0, 1, 2, ..."""
     height, width = frames[0].shape
     with av.open(str(path), "w", options=container_options or {}) as container:
+        container.metadata.update(metadata or {})
         stream = container.add_stream(codec, rate=25)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.codec_context.time_base = time_base
         stream.gop_size = key_interval
         stream.options = options or ({"preset": "veryfast"} if codec == "libx264" else {})
+        if rotation_deg:
+            stream.set_display_rotation(rotation_deg)
         stream.bit_rate = 4_000_000  # MPEG-2 has no other setting of quality
         for number, grey in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")

@@ -233,9 +233,8 @@ _AXES: dict[str, tuple[str, str, Callable[[pd.DataFrame], tuple[pd.Series, pd.Se
     "bracket ft up": ("x [ft]", "y [ft]", lambda t: (t["east"] / FOOT_M, t["north"] / FOOT_M), {"y_axis": "up"}),
     "bracket px": ("x [px]", "y [px]", lambda t: (t["east"] * 5, (90 - t["north"]) * 5), {"gsd_m": 0.2}),
     "degrees": ("Longitude", "Latitude", lambda t: tuple(map(pd.Series, degrees(t))), {}),
-    "said degrees": ("x", "y", lambda t: tuple(map(pd.Series, degrees(t, (-122.3, 47.6)))), {"unit": "deg"}),
+    "said degrees": ("x", "y", lambda t: tuple(map(pd.Series, degrees(t))), {"unit": "deg"}),
 }
-_AXES["said degrees"] = ("x", "y", lambda t: tuple(map(pd.Series, degrees(t))), {"unit": "deg"})
 _EPOCH = pd.Timestamp("2025-10-26T00:59:30Z")
 
 

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from schemas.arrays import FloatArray, IntArray
 from tests.analysis.noisy_tracks import GSD_M, Noise, TrueTracks, analyse, flight, true_numbers
-from tests.benchmarks.analysis import signal_onsets_s
+from tests.benchmarks.analysis import crossings_m, signal_onsets_s
 from velfield.analysis.answers import find_answers
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2
 from velfield.analysis.intervals import Estimate
@@ -78,16 +78,12 @@ class Truth:
     @cached_property
     def crossings_m(self) -> FloatArray:
         """(n, 2) crossings of avenues."""
-        plan = self.flight.city.plan
-        return self._metres(np.array([[x, y] for x in plan.avenues_x for y in plan.avenues_y]))
-
-    def _metres(self, plan_m: FloatArray) -> FloatArray:
-        return self.flight.city.to_px(plan_m) * GSD_M
+        return crossings_m(self.flight)
 
     @cached_property
     def _edges(self) -> tuple[cKDTree, IntArray]:
         edges = self.flight.city.plan.road_network.edges
-        points = self._metres(np.concatenate([edge.path for edge in edges]))
+        points = self.flight.city.to_px(np.concatenate([edge.path for edge in edges])) * GSD_M
         return cKDTree(points), np.repeat(np.arange(len(edges)), [len(edge.path) for edge in edges])
 
     def free_speed_m_per_s(self, xy_m: FloatArray) -> float:

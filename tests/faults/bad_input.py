@@ -33,6 +33,7 @@ from PIL import Image
 from schemas.flight import FlightConfig, FramesConfig
 from tests.media import drifting, write_images, write_times, write_video
 from tests.misb import encode_set, with_checksum
+from tests.track_files import parquet_bytes
 from velfield.errors import InputError, StoreError
 
 LIMIT_S, WAIT_S = 10, 60
@@ -268,7 +269,7 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("table of a run", (table.read_bytes(),), "unit.parquet", lambda path: read_tables([path], columns)),
         Kind("tracks", (b"any seed",), "seed.bin", link_detections),
         Kind("tracks (CSV)", (TRACKS, IMAGE_TRACKS), "tracks.csv", lambda path: read_tracks(path, fps=5.0), 2),
-        Kind("tracks (Parquet)", (_parquet_tracks(),), "tracks.parquet", read_tracks),
+        Kind("tracks (Parquet)", (parquet_bytes(pd.read_csv(io.BytesIO(TRACKS))),), "tracks.parquet", read_tracks),
         Kind("tracks (FCD)", (FCD,), "tracks.xml", read_tracks),
         Kind("tags (JPEG)", (_tagged("JPEG"),), "x.jpg", read_image_telemetry),
         Kind("tags (PNG)", (_tagged("PNG"), _tagged("PNG", late=True)), "x.png", read_image_telemetry),
@@ -316,12 +317,6 @@ def _tagged(kind: str, *, late: bool = False) -> bytes:
     start = data.index(b"eXIf") - 4
     stop = start + 12 + int.from_bytes(data[start : start + 4])
     return data[:start] + data[stop:-12] + data[start:stop] + data[-12:]
-
-
-def _parquet_tracks() -> bytes:
-    out = io.BytesIO()
-    pd.read_csv(io.BytesIO(TRACKS)).to_parquet(out)
-    return out.getvalue()
 
 
 def _annotation_files(names: list[str]) -> tuple[bytes, ...]:

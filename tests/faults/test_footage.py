@@ -3,10 +3,8 @@
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -33,6 +31,7 @@ from velfield.sources.video.corruption import BlockArtifactDetector
 from velfield.synthetic.cases import small_flight
 
 WARNED = FramesConfig()
+FRAMES = list(drifting(6, 160, 128))
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -53,48 +52,29 @@ def planned(folder: Path, frames: Sequence[GreyImage], stage: str, *settings: st
 # ---------------------------------------------------------------------------------------------------------- the video
 
 
-def encoded(path: Path, **settings: object) -> Path:
-    """A video of 6 frames with a property of its codec or its pictures set."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(str(settings.get("codec", "libx264")), rate=25)
-        stream.width, stream.height, stream.pix_fmt = 160, 128, "yuv420p"
-        for name in ("color_trc", "flags"):
-            if name in settings:
-                setattr(stream.codec_context, name, settings[name])
-        stream.options = dict(settings.get("options", {}))
-        if "rotation" in settings:
-            stream.set_display_rotation(settings["rotation"])
-        for number, grey in enumerate(drifting(6, 160, 128)):
-            frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")
-            frame.pts, frame.time_base = number, Fraction(1, 25)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
-
-
 def test_an_interlaced_video_is_reported(tmp_path: Path) -> None:
-    path = encoded(tmp_path / "i.mp4", options={"x264-params": "tff=1"})
+    path = write_video(tmp_path / "i.mp4", FRAMES, options={"x264-params": "tff=1"})
     (line,) = probe(path, frames=WARNED).warnings
     assert line.startswith("the video is interlaced")
 
 
 def test_a_video_of_high_dynamic_range_is_reported(tmp_path: Path) -> None:
-    path = encoded(tmp_path / "h.mp4", options={"x264-params": "transfer=arib-std-b67"})
+    path = write_video(tmp_path / "h.mp4", FRAMES, options={"x264-params": "transfer=arib-std-b67"})
     (line,) = probe(path, frames=WARNED).warnings
     assert "high dynamic range (HLG)" in line
 
 
 def test_rotation_metadata_is_reported_and_pixels_stay_as_stored(tmp_path: Path) -> None:
-    info = probe(encoded(tmp_path / "r.mp4", rotation=90), frames=WARNED)
+    info = probe(write_video(tmp_path / "r.mp4", FRAMES, rotation_deg=90), frames=WARNED)
     (line,) = info.warnings
     assert "rotated by 90 degrees" in line
     assert (info.width, info.height) == (160, 128)
 
 
 def test_a_usual_video_and_one_of_variable_rate_cause_no_warning(tmp_path: Path) -> None:
-    assert probe(encoded(tmp_path / "p.mp4"), frames=WARNED).warnings == ()
+    assert probe(write_video(tmp_path / "p.mp4", FRAMES), frames=WARNED).warnings == ()
     times = [0, 1, 2, 5, 6, 9]
-    info = probe(write_video(tmp_path / "v.mp4", list(drifting(6)), times=times), frames=WARNED)
+    info = probe(write_video(tmp_path / "v.mp4", FRAMES, times=times), frames=WARNED)
     assert info.warnings == ()
     np.testing.assert_allclose(np.diff(info.times_s), np.diff(times) / 25)
 

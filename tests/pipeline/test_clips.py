@@ -8,13 +8,12 @@ import pytest
 
 from schemas.arrays import GreyImage
 from tests.analysis.test_traffic_analysis import EAST, STEP_S, drive, gather
+from tests.scenes import frame_map
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.camera.lens import pinhole
 from velfield.errors import StoreError
 from velfield.exports.georeference import Georeference
 from velfield.pipeline.analysis.analyse import write_analysis
 from velfield.pipeline.analysis.clips import Frames, unusual_clips
-from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
 
 WIDTH, HEIGHT, GSD_M = 1310, 700, 0.2
 GROUND, CAR = 90, 230
@@ -24,13 +23,6 @@ GROUND, CAR = 90, 230
 def analysis() -> TrafficAnalysis:
     """Twelve vehicles to the east, and one that drives the wrong way."""
     return TrafficAnalysis(gather([drive(EAST, 4.0 * k) for k in range(12)] + [drive(EAST[::-1], 20.0)]))
-
-
-def identity() -> FrameTransform:
-    corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
-    norm = fit_normalisation(corners)
-    p = PolyprojectiveTransform.from_homography(np.eye(3), norm, norm)
-    return FrameTransform(width=WIDTH, height=HEIGHT, lens=pinhole((HEIGHT, WIDTH)), polyprojective=p)
 
 
 def frames(analysis: TrafficAnalysis, *, registered: bool = True) -> Frames:
@@ -46,7 +38,8 @@ def frames(analysis: TrafficAnalysis, *, registered: bool = True) -> Frames:
             image[y - 6 : y + 7, x - 12 : x + 13] = CAR
         return image
 
-    return Frames(times, read, lambda frame: identity() if registered else None)
+    identity = frame_map(np.eye(3), (HEIGHT, WIDTH))
+    return Frames(times, read, lambda frame: identity if registered else None)
 
 
 def test_the_vehicle_is_in_the_middle_and_moves_through_the_strip(analysis: TrafficAnalysis) -> None:

@@ -2,17 +2,15 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from schemas.flight import FramesConfig
-from tests.media import drifting
+from tests.media import drifting, write_video
 from velfield.errors import Failure, InputError
 from velfield.sources.capture_times import read_flight_start
 from velfield.sources.clips import clip_files, read_clips_telemetry, write_clip_list
@@ -24,18 +22,8 @@ FRAMES = FramesConfig()
 
 def clip(path: Path, start: str | None, *, frames: int = 10, width: int = 160, seed: int = 0) -> Path:
     """A clip of 25 frames a second with a creation time."""
-    with av.open(str(path), "w") as container:
-        if start is not None:
-            container.metadata["creation_time"] = start
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = width, 120, "yuv420p"
-        stream.codec_context.time_base = Fraction(1, 25)
-        for number, grey in enumerate(drifting(frames, width=width, seed=seed)):
-            frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")
-            frame.time_base, frame.pts = Fraction(1, 25), number
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
+    metadata = {} if start is None else {"creation_time": start}
+    return write_video(path, list(drifting(frames, width=width, seed=seed)), metadata=metadata)
 
 
 def joined(folder: Path, *clips: Path) -> Path:

@@ -1,6 +1,7 @@
 """Tracks of other programs: each format read with its axes, units and times, and what is refused."""
 
 import warnings
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,7 @@ def test_parquet_with_times_of_its_own_kind(tmp_path: Path) -> None:
     assert_left_turn_at_36_km_h(load(tmp_path / "t.parquet", {}), duration_s=t["t"].max())
 
 
+@cache
 def queues(unit_m: float, vehicles: int = 12) -> pd.DataFrame:
     """Vehicles that come at 12 m/s, stand 7 m behind the one before, and drive on, all at 1.5 m/s2; x in a unit."""
     parts = []
@@ -186,14 +188,15 @@ def table_by_rule(number: int) -> tuple[str, bytes, dict[str, object], float]:
     if (called == "m" and suffix) or called == "px":  # y points down by that name
         y = 60.0 + np.sin(table["x_m"] / 50)
     options |= {"gsd_m": 0.2} if unit == "px" else {}
+    time_s = table["time_s"]
     stamps = {
-        "time_s": table["time_s"],
-        "timestamp_ms": (table["time_s"] * 1000).round().astype("int64"),
-        "time": (pd.Timestamp("2025-06-01T12:00:00Z") + pd.to_timedelta(table["time_s"], unit="s")).astype(str),
-        "unixtime": (1.75e12 + table["time_s"] * 1000).round().astype("int64"),
+        "time_s": lambda: time_s,
+        "timestamp_ms": lambda: (time_s * 1000).round().astype("int64"),
+        "time": lambda: (pd.Timestamp("2025-06-01T12:00:00Z") + pd.to_timedelta(time_s, unit="s")).astype(str),
+        "unixtime": lambda: (1.75e12 + time_s * 1000).round().astype("int64"),
     }
     time_name = one(*stamps)
-    made = pd.DataFrame({one("track_id", "Vehicle ID", "ID", "objectId"): table["id"], time_name: stamps[time_name]})
+    made = pd.DataFrame({one("track_id", "Vehicle ID", "ID", "objectId"): table["id"], time_name: stamps[time_name]()})
     made[f"x{suffix}"], made[f"y{suffix}"] = x * per_m, y * per_m
     if lot.random() < 0.3:
         moved = table.groupby("id")[["x_m", "time_s"]].diff().bfill()
