@@ -80,7 +80,7 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
     >>> compare_delays([east, west])
     'it is not fair by waiting time: vehicles from E wait 24 s (14 to 34) longer than those from W'
     >>> compare_delays([west, west])
-    'it is fair by waiting time, as far as is shown: mean delays are within 0 s of each other'
+    'it is not shown to be unfair: mean delays differ by 0 s, at most by 10 s with 90 % probability'
     >>> compare_delays([west], ["E", "N"])
     'whether it is fair is not known: the delay from E and N is not'
     >>> compare_delays([west, west], ["N"])
@@ -95,12 +95,11 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
     by_s = longest.delay_s.value - shortest.delay_s.value
     if by_s < reach_s and lacks:
         return f"{lacks}; those from {list_text([d.arm for d in delays])} are within {by_s:.0f} s"
+    least, most = f"{by_s - reach_s:.0f}", f"{by_s + reach_s:.0f}"
     if by_s < reach_s:
         part = ", in view," if longest.partly or shortest.partly else ""
-        return (
-            f"it is fair by waiting time, as far as is shown: mean delays{part} are within {by_s:.0f} s of each other"
-        )
-    least, most = f"{by_s - reach_s:.0f}", f"{by_s + reach_s:.0f}"
+        by = f"by {by_s:.0f} s, at most by {most} s with 90 % probability"
+        return f"it is not shown to be unfair: mean delays{part} differ {by}"
     longer = f"at least {least} s" if longest.partly else f"{by_s:.0f} s ({least} to {most})"
     return (
         f"it is not fair by waiting time: vehicles from {longest.arm} wait {longer} longer than those from "

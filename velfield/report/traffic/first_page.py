@@ -157,12 +157,7 @@ def _waits(
         but = f"; of the others {first}" if first else ""
         yield f"{place}: which approach waits longest is not known, as the delay from {list_text(unknown)} is not{but}"
     elif len(delays) > 1:
-        most = [d.arm for d in delays if d.partly or d.delay_s.high >= delays[0].delay_s.low]
-        yield (
-            f"{place}: vehicles from {list_text(most)} wait longest"
-            if len(most) < len(delays)
-            else (f"{place}: no approach is shown to wait longest")
-        )
+        yield f"{place}: {first or 'no approach is shown to wait longest'}"
     for name in dict.fromkeys((*(delay.arm for delay in delays), *by_length)):
         said = [count_text(found.entered(name), "vehicle")]
         said += [f"mean delay {delay.text}" for delay in delays if delay.arm == name] or [
