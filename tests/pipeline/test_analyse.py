@@ -89,7 +89,8 @@ def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str
     analyse(tracks=folder.parent / "tracks.csv", out=folder.parent / "again")
     text = capsys.readouterr().out
     assert re.search(r"signal +junction \d: cycle 40.0 s \(\d", text)
-    assert re.search(r"junction \d, W to E: \d+ vehicles, \d+ % \(\d+ to \d+\) of \d+ from W", text)
+    assert re.search(r"junction \d, W to E: \d+ vehicles, \d+ % \(\d+ to \d+\) of those from W", text)
+    assert re.search(r"delay +junction \d from W: mean \d+ s \(\d+ to \d+, n \d+\), level of service [A-F]", text)
     assert re.search(r"u-turns +none in \d.* min, so fewer than \d", text)
     assert "directions  north is not known: N is the top of the image, W its left\n" in text
 
