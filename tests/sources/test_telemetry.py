@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -117,6 +118,8 @@ def test_subtitles_in_the_video_are_read_as_those_beside_it(tmp_path: Path) -> N
     beside = parse_srt(srt_text(texts, times_s), "x.srt")
     assert inside.height_m.tolist() == beside.height_m.tolist() == [100.0, 101.0, 102.0, 103.0, 104.0]
     assert inside.time_s == pytest.approx(times_s, abs=1e-3)
+    with av.open(str(path)) as made:
+        assert not made.streams.video[0].codec_context.has_b_frames
 
 
 def test_a_video_without_telemetry_gives_the_reason(tmp_path: Path) -> None:
