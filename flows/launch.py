@@ -44,6 +44,9 @@ _MEMORY: dict[str, tuple[int, int]] = {
 """glibc's settings: environment for workers; number and bytes for `mallopt` here. Images of some MB are
 allocated and freed all the time: from and to the system each time, they cost a quarter of all processor time; with the
 64 KiB that Dask sets for its workers half as much again."""
+_LARGE_ARRAYS = 1 << 30
+"""`MALLOC_MMAP_THRESHOLD_` of an analysis: arrays of all tracks, of tens of MB and more, cost it an eighth of its time
+from and to the system. Runs would hold some 150 MB more at 4K."""
 _HOMES = {"PREFECT_HOME": "prefect", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "cache"}
 """Environment: folders that libraries have in the home folder, and their names in a temporary one."""
 _THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
@@ -63,7 +66,7 @@ def prepare_process(*, verbose: bool) -> None:
     """Set this process up to run flows. Call before prefect is imported."""
     for name, value in (_SETTINGS if verbose else _SETTINGS | _QUIET).items():
         os.environ.setdefault(name, value)
-    _keep_memory()
+    keep_memory()
     import cv2
 
     # The work is parallel by frames: OpenCV's own threads would only compete with it.
@@ -116,9 +119,11 @@ def use_writable_folders() -> None:
     )
 
 
-def _keep_memory() -> None:
+def keep_memory(*, large_arrays: bool = False) -> None:
+    """Keep freed memory for what is allocated next, that of large arrays too if asked for."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    for name, (number, size) in _MEMORY.items():
+    larger = {"MALLOC_MMAP_THRESHOLD_": (-3, _LARGE_ARRAYS)} if large_arrays else {}
+    for name, (number, size) in (_MEMORY | larger).items():
         if name not in os.environ:
             os.environ[name] = str(size)
             if mallopt is not None:

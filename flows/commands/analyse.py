@@ -44,9 +44,11 @@ def analyse(
         Name of an arm in place of its direction: `3.W=Mill Road` of junction 3, `W=Mill Road` of a road into the scene.
         Repeatable.
     """
+    from flows.launch import keep_memory
     from velfield.errors import InputError
     from velfield.pipeline.analysis.analyse import analyse_run, analyse_tracks
 
+    keep_memory(large_arrays=True)
     unnamed = [one for one in arm if not all(part.strip() for part in one.partition("=")[::2])]
     if unnamed:
         raise InputError(f"--arm {unnamed[0]!r}: expected DIRECTION=NAME, as 3.W='Mill Road' or W='Mill Road'")

@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 
+from flows.launch import keep_memory
 from tests.benchmarks.analysis import CYCLE_S, GSD_M, moving, simulate
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import make_trajectories
@@ -73,6 +74,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=931)
     parser.add_argument("--minutes", type=float, default=6.0)
     arguments = parser.parse_args()
+    keep_memory(large_arrays=True)  # as `velfield analyse` does
     answer(repeat(arguments.seed, arguments.minutes, 500))  # kernels are compiled at their first call
     for tracks in arguments.tracks:
         columns = repeat(arguments.seed, arguments.minutes, tracks)

@@ -109,3 +109,15 @@ def test_a_server_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPat
         check_server()
     assert "\n" not in str(caught.value)
     assert "`prefect config unset PREFECT_API_URL`" in str(caught.value)
+
+
+def test_an_analysis_keeps_the_memory_of_large_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    for large, threshold in ((False, 32 << 20), (True, 1 << 30)):
+        for name in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"):
+            monkeypatch.setenv(name, "")
+            monkeypatch.delenv(name)
+        launch.keep_memory(large_arrays=large)
+        assert os.environ["MALLOC_MMAP_THRESHOLD_"] == str(threshold)
+    monkeypatch.setenv("MALLOC_MMAP_THRESHOLD_", "4096")
+    launch.keep_memory(large_arrays=True)
+    assert os.environ["MALLOC_MMAP_THRESHOLD_"] == "4096"  # the user's
