@@ -234,15 +234,14 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
 
 def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:
     """The delay of each approach of a junction where ways meet; of the others what is missing, in one answer."""
-    seen_s = float(np.diff(analysis.trajectories.observed_s).max())
     if not analysis.ways_meet(found.junction.number):
         return
-    subject, delays = f"junction {found.junction.number}", approach_delays(analysis, found)
+    subject, seen_s = f"junction {found.junction.number}", float(np.diff(analysis.trajectories.observed_s).max())
     if seen_s < MIN_DELAY_S:
-        yield Answer(
-            "delay", subject, "too little data", f"too little data: {seen_s:.0f} s, {MIN_DELAY_S:.0f} s needed"
-        )
+        text = f"too little data: {seen_s:.0f} s, {MIN_DELAY_S:.0f} s needed"
+        yield Answer("delay", subject, "too little data", text)
         return
+    delays = approach_delays(analysis, found)
     for delay in delays:
         yield Answer("delay", f"{subject} from {delay.arm}", "found", f"mean {delay.text}", delay.delay_s, "s")
     unknown = arms_without_delay(found, delays)
@@ -262,9 +261,10 @@ def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -
     found = next(found for found in analysis.movements if found.junction.number == junction)
     mine = {lane: arm for lane, arm in found.gates.arms_in.items() if lane in lanes}
     turns = dict.fromkeys(TURNS[m.turn] for lane in mine for m in found.movements_of(lane))
+    if not mine:
+        return f"{lanes_text(lanes)}: "
     ways = f", {list_text([*turns])}" if turns else ""
-    arms = f"from {list_text(sorted(set(mine.values())))}{ways} " if mine else ""
-    return f"{arms}({lanes_text(lanes)}): " if arms else f"{lanes_text(lanes)}: "
+    return f"from {list_text(sorted(set(mine.values())))}{ways} ({lanes_text(lanes)}): "
 
 
 def _conflicts(analysis: TrafficAnalysis) -> Answer:

@@ -11,7 +11,7 @@ from schemas.analysis import Turn
 from velfield.analysis.flow.volume import LOS_SIGNAL_S, LOS_YIELD_S, delay_level
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.movements.movements import JunctionMovements
-from velfield.analysis.signals.cycles import Queue, queues
+from velfield.analysis.signals.cycles import Queue
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import count_text, list_text
 
@@ -122,7 +122,7 @@ def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[
     for stream in signal.streams if signal else ():
         lane = stream.stream.approach.lane
         name = arm.get(lane)
-        for queue in queues(stream.stream, stream.green_s):
+        for queue in stream.queues:
             if name and queue.vehicles.value and (name not in out or queue.length_m > out[name][1].length_m):
                 out[name] = lane, queue
     return out

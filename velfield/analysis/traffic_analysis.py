@@ -37,7 +37,7 @@ from velfield.analysis.movements.time_slices import (
     origins_by_slice,
     slice_edges,
 )
-from velfield.analysis.signals.cycles import JunctionSignal, ends_out_of_view, find_signal
+from velfield.analysis.signals.cycles import JunctionSignal, find_signal
 from velfield.analysis.signals.queues import Stops, Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
@@ -195,7 +195,7 @@ class TrafficAnalysis:
         for found in self.movements:
             signal, arm = self.signals.get(found.junction.number), found.gates.arms_in
             for one in signal.streams if signal else ():
-                if ends_out_of_view(one):
+                if any(queue.reaches_edge for queue in one.queues):
                     out.add((found.junction.number, arm.get(one.stream.approach.lane, "")))
         return out
 

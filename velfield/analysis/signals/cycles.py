@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import special
@@ -67,6 +68,11 @@ class StreamSignal:
     start_up_lost_s: Estimate | None
     saturation_veh_per_h: Estimate | None
     """Time that a queue's first four vehicles lose, and flow of those behind them."""
+
+    @cached_property
+    def queues(self) -> list["Queue"]:
+        """The queue at each onset of green."""
+        return queues(self.stream, self.green_s)
 
 
 @dataclass(frozen=True)
@@ -361,11 +367,6 @@ def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
         reaches_edge = found.seen > 0 and stream.stop_line_m - found.length_m < edge_m
         out.append(Queue(float(time), vehicles, found.length_m, reaches_edge))
     return out
-
-
-def ends_out_of_view(stream: StreamSignal) -> bool:
-    """Whether a queue of a stream ends out of view at a green: how long it is is not known."""
-    return any(queue.reaches_edge for queue in queues(stream.stream, stream.green_s))
 
 
 def green_duration_s(streams: Sequence[StreamSignal], cycle_s: float) -> float | None:

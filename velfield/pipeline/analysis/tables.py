@@ -16,7 +16,7 @@ from velfield.analysis.intervals import MIN_VEHICLES
 from velfield.analysis.lanes.model import Lane
 from velfield.analysis.movements.movements import JunctionMovements, Movement
 from velfield.analysis.movements.reversals import Reversal
-from velfield.analysis.signals.cycles import JunctionSignal, Queue, StreamSignal, queues, stopping_share
+from velfield.analysis.signals.cycles import JunctionSignal, Queue, StreamSignal, stopping_share
 from velfield.analysis.signals.phases import START_DELAY_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.unusual import DoubtfulPlace, Unusual
@@ -241,9 +241,7 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
 def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Signals by stream."""
     rows = [
-        (signal.junction, stream, queues(stream.stream, stream.green_s))
-        for signal in analysis.signals.values()
-        for stream in signal.streams
+        (signal.junction, stream, stream.queues) for signal in analysis.signals.values() for stream in signal.streams
     ]
     columns: list[Column[tuple[int, StreamSignal, list[Queue]]]] = [
         Column("junction", "Junction", "", lambda row: row[0]),
