@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
 from flows.prefect_server import may_have_settings
-from flows.stopping import end_children, stop_on_signals
+from flows.stopping import Stopped, end_children, stop_on_signals
 from velfield.errors import InputError, count_text
 from velfield.pipeline.watch import FolderWatcher, is_flight, is_telemetry
 
@@ -263,7 +263,7 @@ def run_deployments(config: ServeConfig) -> None:
         """Prefect's own answer to SIGTERM calls a coroutine without awaiting it (3.8.8), so that nothing is stopped."""
 
         def handle_sigterm(self, *_: Any, **__: Any) -> None:
-            raise KeyboardInterrupt
+            raise Stopped
 
     runner = Interruptible(pause_on_shutdown=False, limit=config.limit)
     for deployment in deployments(config):

@@ -86,8 +86,12 @@ def as_ctrl_c() -> None:
         signal.signal(number, _stop)
 
 
+class Stopped(KeyboardInterrupt):
+    """A class of its own: after a plain one within `exec`, as dataclasses use, Python ends by SIGINT though caught."""
+
+
 def _stop(_number: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+    raise Stopped
 
 
 def _end_late(receiver: socket.socket, _sender: socket.socket, grace_s: float) -> None:

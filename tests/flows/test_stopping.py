@@ -1,4 +1,4 @@
-"""A process that is killed leaves nothing running behind."""
+"""A process that is killed leaves nothing running behind, and one that is stopped ends as it says."""
 
 import os
 import signal
@@ -38,3 +38,25 @@ def test_what_a_process_started_ends_with_it(kill: bool) -> None:
                 assert bystander.poll() is None
             finally:
                 bystander.kill()
+
+
+_IS_STOPPED_IN_AN_EXEC = """if True:
+    import time
+    from flows.stopping import as_ctrl_c
+    as_ctrl_c()
+    try:
+        exec("print('ready', flush=True); time.sleep(60)")  # as while a module with dataclasses is imported
+    except KeyboardInterrupt:
+        print("stopped")
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_interrupt_that_is_caught_leaves_the_status_alone(number: signal.Signals) -> None:
+    command = [sys.executable, "-c", _IS_STOPPED_IN_AN_EXEC]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        assert process.stdout.read() == "stopped\n"
+        assert process.wait(20) == 0
