@@ -41,6 +41,9 @@ class Previews:
     runner: Runner
     console: Console
 
+    urgent = False
+    """Whether the task under way is the first preview: a person waits for it."""
+
     def __post_init__(self) -> None:
         # On S3 folders are not renamed in one step.
         self._off = not self.plan.config.work.previews or is_remote(self.plan.layout.root)
@@ -57,6 +60,7 @@ class Previews:
         if not self._first_tried:
             self._first_tried = True
             if self.plan.is_long and not self.plan.layout.report.exists():
+                self.urgent = True
                 return lambda: self._make(self._show_first_frames)
         found = next((stage for stage in stages if stage.stage.name == "detections"), None)
         if found is None or not self._is_worth_it(found):
@@ -122,6 +126,7 @@ class Previews:
 
     def finish(self, error: BaseException | None) -> None:
         """A preview that fails, fails alone."""
+        self.urgent = False
         if isinstance(error, InputError):
             self.console.event("note", f"  no map of the first frames: {error}")
         elif error is not None:

@@ -24,6 +24,8 @@ from velfield.run.commits import WHOLE, read_commits
 if TYPE_CHECKING:
     from velfield.pipeline.stages.rebase import Rebase
 
+_FEW = 2
+"""Units at a time that would take more from urgent work beside them than they gain."""
 _QUEUED = 1
 """Units submitted beyond those that run, so that a thread that is done finds the next one."""
 
@@ -50,6 +52,9 @@ class UnderWay:
 
 class Aside(Protocol):
     """Work beside the stages, none of whose results they read: done where there is some, in place of a unit."""
+
+    urgent: bool
+    """Whether units wait for the task under way where few run at a time."""
 
     def next_task(self, stages: Sequence[UnderWay]) -> Callable[[], None] | None:
         """The next task, None if there is nothing to do."""
@@ -125,12 +130,16 @@ class Work:
         left = [k for k in range(len(under_way.units)) if k not in under_way.ended]
         while left or self._running:
             self._submit_aside()
-            while left and self._running < self.at_once + _QUEUED - (self._beside is not None):
+            most = self.at_once + _QUEUED - (self._beside is not None)
+            while left and self._running < most and not self._waits_for_aside():
                 self._submit(under_way, left.pop(0))
             k = self._next_end()
             if k is not None:
                 self._end(under_way, k)
         self._finish(under_way)
+
+    def _waits_for_aside(self) -> bool:
+        return self._beside is not None and self.aside is not None and self.aside.urgent and self.at_once <= _FEW
 
     def _next_end(self) -> int | None:
         """Wait until something ends: the number of a unit, or None where it is the work beside."""

@@ -15,9 +15,10 @@ from flows.runners import RunnerConfig, open_runner
 from tests.small_flight import FRAMES, digests, job
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.preview import make_first_preview, publish_first_preview
+from velfield.run.frame_transforms import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
-from velfield.run.stores import FieldStore
+from velfield.run.stores import FieldStore, FrameStore
 
 
 class Recording(Console):
@@ -80,7 +81,7 @@ def test_previews_come_and_grow_and_leave_no_trace(
     assert console.warnings == []
     # Of the first frames, by the detector that ships; then of the first unit, whose windows reach into the second.
     first, then = (found for found, _, _ in console.seen)
-    assert first == 16
+    assert first == 12
     assert then in (8, 16)  # of the first unit, or of both that were through when it began
     for found, title, vehicles in console.seen:
         assert f"{found} of {FRAMES} frames" in title or f"the first {found} of" in title
@@ -93,14 +94,29 @@ def test_previews_come_and_grow_and_leave_no_trace(
 def test_a_worker_makes_the_first_preview_by_itself(flight: Path, tmp_path: Path) -> None:
     plan = make_plan(job(flight, tmp_path / "run"))
     with open_runner(RunnerConfig(workers=1)) as runner:
-        assert runner.call(make_first_preview, plan) == 16
+        assert runner.call(make_first_preview, plan) == 12
     preview = RunLayout(plan.layout.preview)
     assert preview.field.is_dir()
     assert not plan.layout.report.exists()
     publish_first_preview(plan, nullcontext())
-    assert "the first 16 of" in plan.layout.report.read_text()
+    assert "the first 12 of" in plan.layout.report.read_text()
     assert plan.layout.field.is_dir()
     assert not preview.root.exists()
+
+
+def test_the_first_preview_of_large_frames_is_made_at_half_their_size(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("velfield.pipeline.preview._LARGE_PX", 0)
+    nothing = {"base": None, "labels": None}
+    given = job(flight, tmp_path / "run")
+    plan = make_plan(given.model_copy(update={"inputs": given.inputs.model_copy(update=nothing)}))
+    assert make_first_preview(plan) == 12
+    height, width = plan.frame_shape
+    preview = RunLayout(plan.layout.preview)
+    assert FrameStore(preview.frames).read(0).shape == (height // 2, width // 2)
+    assert read_grid(preview).gsd_m == pytest.approx(2 * 0.23, rel=0.01)
+    assert int(FieldStore(preview.field).layer("count").sum()) > 100
 
 
 @pytest.mark.usefixtures("_always")

@@ -55,6 +55,13 @@ class Plan:
     """Content key of each stage."""
     lost: tuple[str, ...] = ()
     """Units that failed, ``stage unit`` each: what was there of them is not read."""
+    reduction: int = 1
+    """Frames are processed at one in so many of the source pixels along either axis: in a preview of large ones."""
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Shape (h, w) of a frame as it is processed."""
+        return self.info.height // self.reduction, self.info.width // self.reduction
 
     @property
     def layout(self) -> RunLayout:

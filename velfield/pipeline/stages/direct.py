@@ -58,7 +58,7 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
     Where their control points decide for another lens, it is written to ``base/lens.json``.
     """
     config, store = plan.config.registration, FrameStore(plan.layout.frames)
-    shape = (plan.info.height, plan.info.width)
+    shape = plan.frame_shape
     reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=shape)
     frames = trial_frames(sorted(keypoints))
 
@@ -98,7 +98,7 @@ def _refine_by_one(
     for _ in range(_LENS_ROUNDS):
         if not result.ok or _is_accurate(result):
             break
-        fit = _fit_lens([result], lens, (plan.info.height, plan.info.width))
+        fit = _fit_lens([result], lens, plan.frame_shape)
         if fit is None:
             break
         again = register(frame, fit.lens)

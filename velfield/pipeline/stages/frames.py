@@ -10,10 +10,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.arrays import IntArray
+from schemas.arrays import GreyImage, IntArray
 from velfield.errors import InputError
 from velfield.parallel import for_each_behind
 from velfield.pipeline.plan import Plan
@@ -111,12 +112,13 @@ def create_frame_store(plan: Plan) -> None:
     path = plan.layout.frames
     if is_cut_as(path, plan.keys["frames"], plan.unit_frames):
         return
+    height, width = plan.frame_shape
     create_frames(
         path,
         key=plan.keys["frames"],
         count=plan.frame_count,
-        height=plan.info.height,
-        width=plan.info.width,
+        height=height,
+        width=width,
         unit_frames=plan.unit_frames,
         source=plan.inputs.source.model_dump(),
     )
@@ -137,12 +139,13 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
 
     def keep(numbered: tuple[int, SourceFrame]) -> None:
         k, found = numbered
-        store.write(frames[k], found.grey)
+        grey = found.grey if plan.reduction == 1 else _reduce(found.grey, plan.frame_shape)
+        store.write(frames[k], grey)
         flags[k] = found.flags
         if found.reason:
             warnings.append(f"frame {frames[k]} ({found.time_s:.3f} s, source frame {found.name}): {found.reason}")
         if not found.flags & FrameFlag.UNREADABLE:
-            quality = frame_quality(found.grey)
+            quality = frame_quality(grey)
             sharpness[k], brightness[k], thumbnails[k] = quality.sharpness, quality.brightness, quality.thumbnail
         advance("frames")
 
@@ -163,3 +166,7 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
     return StageResult(
         store.files(frames.start, frames.stop), {"frames": len(frames), "usable": usable}, warnings=warnings
     )
+
+
+def _reduce(grey: GreyImage, shape: tuple[int, int]) -> GreyImage:
+    return np.asarray(cv2.resize(grey, shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)

@@ -55,7 +55,8 @@ def create_registration_store(plan: Plan) -> None:
     path = plan.layout.registration
     if is_cut_as(path, plan.keys["registration"], plan.unit_frames):
         return
-    length = vector_length(plan.info.width, plan.info.height, plan.config.registration)
+    height, width = plan.frame_shape
+    length = vector_length(width, height, plan.config.registration)
     create_registration(
         path,
         key=plan.keys["registration"],
@@ -97,7 +98,8 @@ def _detect_keypoints(plan: Plan, frame: int, grey: GreyImage) -> Keypoints:
 
 def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[int, FrameRegistration]) -> StageResult:
     config = plan.config.registration
-    length = vector_length(plan.info.width, plan.info.height, config)
+    height, width = plan.frame_shape
+    length = vector_length(width, height, config)
     vectors = np.full((len(frames), length), np.nan)
     columns = {name: np.full(len(frames), fill_value(dtype), dtype) for name, dtype in REGISTRATION_COLUMNS.items()}
     cells = {"error_px": ERROR_CELLS, "position_sd_px": POSITION_SD_CELLS}
