@@ -26,14 +26,23 @@ Track = tuple[FloatArray, FloatArray]
 """Times (n,) and positions (n, 2) m."""
 
 
-def drive(path: FloatArray, start_s: float, *, stop_at_m: float | None = None, go_s: float = 0.0) -> Track:
-    """Along a path at 12 m/s; a stop at a place until a time, with comfortable braking and starting."""
+def drive(
+    path: FloatArray,
+    start_s: float,
+    *,
+    stop_at_m: float | None = None,
+    go_s: float = 0.0,
+    waits: tuple[float, float] | None = None,
+) -> Track:
+    """Along a path at 12 m/s; a stop at a place until a time, with comfortable braking and starting. ``waits``: place
+    of a second stop, m, and its end, s."""
     along = np.concatenate([[0.0], np.hypot(*np.diff(path, axis=0).T).cumsum()])
+    stops = ([] if stop_at_m is None else [(stop_at_m, go_s)]) + ([waits] if waits else [])
     s, v, t, out = 0.0, SPEED, start_s, []
     while s < along[-1]:
         out.append((t, s))
-        held = stop_at_m is not None and t < go_s and s <= stop_at_m + 1.0
-        limit = np.sqrt(2 * 2.5 * max((stop_at_m or 0.0) - s, 0.0)) if held else SPEED
+        held = [at for at, until_s in stops if t < until_s and s <= at + 1.0]
+        limit = min((np.sqrt(2 * 2.5 * max(at - s, 0.0)) for at in held), default=SPEED)
         v = max(min(v + 2.0 * STEP_S, limit, SPEED), 0.0)
         v = 0.0 if held and v < 0.4 else v
         s, t = s + v * STEP_S, t + STEP_S

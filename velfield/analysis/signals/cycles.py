@@ -9,7 +9,7 @@ from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
-from velfield.analysis.signals.phases import fit_phases
+from velfield.analysis.signals.phases import fit_phases, start_together
 from velfield.analysis.signals.queues import REACH_M, Stream
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
@@ -98,10 +98,8 @@ def find_signal(
     The cycle is that of the time with most starts of queues: over a gap, as between clips, its error would grow to a
     cycle. In the other times the signal is late by what their own starts show.
     """
-    by_time = [
-        [(stream, times) for stream in streams if len(times := _within(_queue_heads(stream), *seen)) >= MIN_STARTS]
-        for seen in observed_s
-    ]
+    streams = _at_stop_lines(streams, observed_s)
+    by_time = _starts_by_time(streams, observed_s)
     counts = [sum(len(times) for _, times in found) for found in by_time]
     main = int(np.argmax(counts)) if counts else 0
     used = [stream for stream, _ in by_time[main]] if counts else []
@@ -147,6 +145,45 @@ def find_signal(
     signals = [_stream_signal(used[k], phase.green_s, estimate, seen_late) for phase in phases for k in phase.streams]
     lanes = tuple(tuple(sorted(used[k].approach.lane for k in phase.streams)) for phase in phases)
     return JunctionSignal(junction, True, "", estimate, _with_hidden_share(signals), lanes)
+
+
+def _starts_by_time(streams: Sequence[Stream], observed_s: FloatArray) -> list[list[tuple[Stream, FloatArray]]]:
+    """The streams whose queues start often enough in each of the times (k, 2), and the times of these starts."""
+    return [
+        [(stream, times) for stream in streams if len(times := _within(_queue_heads(stream), *seen)) >= MIN_STARTS]
+        for seen in observed_s
+    ]
+
+
+def _at_stop_lines(streams: Sequence[Stream], observed_s: FloatArray) -> list[Stream]:
+    """Each stream by the line at which its queues stand at red.
+
+    The first of a queue may stop at two places. Where the starts at both are in one part of the cycle, the foremost is
+    the line: a vehicle that was not seen stood ahead of the others. Where they are not, vehicles that have passed the
+    line wait for a gap at the foremost. Without a cycle it is the foremost.
+    """
+    every = [(stream, stream.upstream or stream) for stream in streams]
+    if all(stream is upstream for stream, upstream in every):
+        return list(streams)
+    best, cycle_s = 0.0, 0.0
+    for lines in zip(*every, strict=True):
+        found = max(_starts_by_time(lines, observed_s), key=lambda one: sum(len(times) for _, times in one))
+        events, duration = [times for _, times in found], float(np.diff(observed_s).max())
+        fit = _fit_period(events, min(MAX_CYCLE_S, duration)) if events and duration > 2 * MIN_CYCLE_S else None
+        # so many starts recur
+        if fit is not None and fit[1] >= _MIN_CONCENTRATION and fit[1] * sum(map(len, events)) > best:
+            cycle_s, best = fit[0], fit[1] * sum(map(len, events))
+    if not best:
+        return list(streams)
+    return [upstream if _waits_beyond(stream, upstream, cycle_s) else stream for stream, upstream in every]
+
+
+def _waits_beyond(stream: Stream, upstream: Stream, cycle_s: float) -> bool:
+    """Whether vehicles wait for a gap at the foremost line, and for green at the one before."""
+    at_gap, at_green = _queue_heads(stream), _queue_heads(upstream)
+    if len(at_green) < MIN_STARTS or abs(np.exp(2j * np.pi * at_green / cycle_s).mean()) < _MIN_CONCENTRATION:
+        return False
+    return len(at_gap) < MIN_STARTS or not start_together(at_gap, at_green, cycle_s)
 
 
 def _with_hidden_share(signals: Sequence[StreamSignal]) -> tuple[StreamSignal, ...]:
@@ -196,6 +233,19 @@ def _stopping(streams: Sequence[Stream]) -> tuple[int, Estimate | None]:
 
 def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, float, float] | None:
     """The period at which the starts of each stream recur: s, concentration, and probability by chance."""
+    found = _fit_period(events, longest_s)
+    if found is None:
+        return None
+    cycle_s, concentration, frequency = found
+    n = sum(len(times) for times in events)
+    if n <= _DRAWN_STARTS:
+        return cycle_s, concentration, _chance(events, frequency, concentration)
+    excess = max(n * concentration - 1.0 * len(events), 0.0) ** 2 / n
+    return cycle_s, concentration, float(min(len(frequency) / 5 * np.exp(-excess), 1.0))
+
+
+def _fit_period(events: Sequence[FloatArray], longest_s: float) -> tuple[float, float, FloatArray] | None:
+    """The period at which the starts of each stream recur best: s, concentration, and the frequencies tried, Hz."""
     n = sum(len(times) for times in events)
     span = max(float(np.ptp(times)) for times in events)
     if span < MIN_CYCLE_S:
@@ -209,11 +259,7 @@ def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, 
     fine = np.linspace(frequency[max(best - 1, 0)], frequency[min(best + 1, len(frequency) - 1)], 201)
     sharp = sum(np.abs(np.exp(2j * np.pi * fine[:, None] * times).sum(axis=1)) for times in events) / n
     k = int(np.argmax(sharp))
-    concentration = float(sharp[k])
-    if n <= _DRAWN_STARTS:
-        return float(1 / fine[k]), concentration, _chance(events, frequency, concentration)
-    excess = max(n * concentration - 1.0 * len(events), 0.0) ** 2 / n
-    return float(1 / fine[k]), concentration, float(min(len(frequency) / 5 * np.exp(-excess), 1.0))
+    return float(1 / fine[k]), float(sharp[k]), frequency
 
 
 def _concentration(frequency: FloatArray, events: Sequence[FloatArray]) -> FloatArray:

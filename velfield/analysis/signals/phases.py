@@ -82,6 +82,12 @@ def _group(phases_s: Sequence[float], cycle_s: float) -> list[list[int]]:
     return [members for _, members in groups]
 
 
+def start_together(a_s: FloatArray, b_s: FloatArray, cycle_s: float) -> bool:
+    """Whether most starts of two streams are in one part of the cycle."""
+    apart = _circular_median(a_s, cycle_s) - _circular_median(b_s, cycle_s)
+    return bool(abs(_wrap(np.array(apart), cycle_s)) < _TOGETHER_S)
+
+
 def _wrap(value: FloatArray, cycle_s: float) -> FloatArray:
     return (value + cycle_s / 2) % cycle_s - cycle_s / 2
 

@@ -18,6 +18,12 @@ _HIDDEN_MOVE_M = 1.0
 """A vehicle that is seen again so much farther on did not stand where it is seen."""
 _SETS_OFF_M_PER_S2 = 2.0
 """Acceleration of a vehicle that sets off."""
+_LINE_M = 3.0
+"""The first of a queue stops so near to its line at most."""
+_AHEAD_M, _AHEAD_S = 20.0, 5.0
+"""A vehicle that stood so far ahead at most, so long before another set off at most, was in its way."""
+_UPSTREAM_M, _RECUR_SHARE = 4.0, 0.25
+"""Another line lies so far before the foremost at least, and so many stop there, to the place where most do."""
 _CROSSES_S = 8.0
 """From its start to its crossing of the line, a vehicle at the head of a queue needs no longer."""
 
@@ -170,6 +176,9 @@ class Stream:
         Standard deviation of a stop's start or end.
     hidden_share
         Share of the vehicles in queues that are not seen, at least.
+    upstream
+        The same traffic by another line, at which the first of queues stop, too: vehicles that give way wait beyond a
+        stop line, and where the first of a queue was missed the second seems to be it. None: there is one place.
     cross_time_s, cross_track, cross_speed_m_per_s
         When tracks cross the stop line (the border without one), and how fast; in time order.
     """
@@ -189,6 +198,7 @@ class Stream:
     stop_seen_s: FloatArray
     stop_time_sd_s: float
     hidden_share: float = 0.0
+    upstream: "Stream | None" = None
 
 
 def observe_stream(
@@ -197,36 +207,54 @@ def observe_stream(
     """Stops and crossings on an approach; ``lengths_m`` (tracks,) of the vehicles, None: a car's."""
     along, across = _along(approach.path_m, stops.xy_m)
     here = np.flatnonzero((across < 1.6) & (along > 1.0) & (along < len(approach.path_m) - 2))
-    along = along[here]
-    known = here[np.isfinite(stops.end_s[here])]
-    half = (np.full(len(stops.track), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m[stops.track]) / 2
-    goes = np.isfinite(stops.end_s[here])
-    line = _stop_line(along[goes] + half[here][goes], approach.border_m)
-    at = approach.border_m if line is None else min(line, len(approach.path_m) - 4.0)
-    time, track, speed = _crossings(approach.path_m, at, samples)
-    time = _after_stops(time, track, at, stops.track[known], stops.start_s[known], stops.end_s[known], along[goes])
-    order = np.argsort(time, kind="stable")
-    cross = time[order], track[order], speed[order]
-    heads = np.empty(0, np.int64)
-    if line is not None:
-        front = _along(approach.path_m, stops.xy_m[known])[0] + half[known]
-        heads = known[np.abs(front - line) < 3.0]
+    length = np.full(len(here), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m[stops.track[here]]
+    front = along[here] + length / 2
+    known = np.isfinite(stops.end_s[here])
+    line = _stop_line(front[known], approach.border_m)
+    first = known.copy()
+    first[known] = _is_first(
+        stops.track[here][known], stops.start_s[here][known], stops.end_s[here][known], front[known]
+    )
+
+    def observe(line: float | None, upstream: Stream | None) -> Stream:
+        at = approach.border_m if line is None else min(line, len(approach.path_m) - 4.0)
+        time, track, speed = _crossings(approach.path_m, at, samples)
+        rows = here[known]
+        time = _after_stops(time, track, at, stops.track[rows], stops.start_s[rows], stops.end_s[rows], along[rows])
+        order = np.argsort(time, kind="stable")
+        cross = time[order], track[order], speed[order]
+        heads = here[first & (np.abs(front - (np.inf if line is None else line)) < _LINE_M)]
         heads = heads[_goes_on(stops.track[heads], stops.end_s[heads], cross[1], cross[0])]
         heads = heads[np.argsort(stops.end_s[heads])]
-    return Stream(
-        approach,
-        line,
-        stops.end_s[heads],
-        stops.track[heads],
-        stops.track[here],
-        stops.start_s[here],
-        stops.end_s[here],
-        along,
-        *cross,
-        2 * half[here],
-        stops.seen_s[here],
-        stops.time_sd_s,
-    )
+        return Stream(
+            approach,
+            line,
+            stops.end_s[heads],
+            stops.track[heads],
+            stops.track[here],
+            stops.start_s[here],
+            stops.end_s[here],
+            along[here],
+            *cross,
+            length,
+            stops.seen_s[here],
+            stops.time_sd_s,
+            upstream=upstream,
+        )
+
+    before = None if line is None else _line_upstream(front[first], line, approach.border_m)
+    return observe(line, None if before is None else observe(before, None))
+
+
+def _is_first(track: IntArray, start_s: FloatArray, end_s: FloatArray, front_m: FloatArray) -> Mask:
+    """Whether nobody stood ahead of each stop (n,) as it ended."""
+    order = np.argsort(end_s, kind="stable")
+    out = np.ones(len(track), bool)
+    for at, row in enumerate(order):
+        left = order[np.searchsorted(end_s[order], end_s[row] - _AHEAD_S) : at]
+        ahead = front_m[left] - front_m[row]
+        out[row] = not np.any((ahead > _LINE_M) & (ahead < _AHEAD_M) & (track[left] != track[row]))
+    return out
 
 
 def _after_stops(
@@ -273,15 +301,28 @@ def _along(path_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _stop_line(front_m: FloatArray, border_m: float) -> float | None:
     """Where the foremost of many stops are, front bumpers: the last peak of their density near the border."""
+    place, density = _places(front_m, border_m)
+    strong = place[density > 0.4 * density.max(initial=0.0)]
+    return float(strong[-1]) if len(strong) else None
+
+
+def _line_upstream(first_m: FloatArray, line_m: float, border_m: float) -> float | None:
+    """Where most of the vehicles with nobody ahead stop before the foremost line; None: nowhere twice."""
+    place, density = _places(first_m, border_m)
+    before = (place < line_m - _UPSTREAM_M) & (density > _RECUR_SHARE * density.max(initial=0.0))
+    before &= density > 1.5  # two stops at one place
+    return float(place[before][np.argmax(density[before])]) if before.any() else None
+
+
+def _places(front_m: FloatArray, border_m: float) -> tuple[FloatArray, FloatArray]:
+    """Places along the path, near the border, where vehicles stop, and how many do at each."""
     front = front_m[np.abs(front_m - border_m) < 25.0]
     if len(front) < 2:
-        return None
+        return np.empty(0), np.empty(0)
     grid = np.arange(front.min() - 1, front.max() + 1, 0.25)
     density = np.exp(-0.5 * ((grid[:, None] - front) / 0.8) ** 2).sum(axis=1)
-    peak = (density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:])
-    rows = np.flatnonzero(peak) + 1
-    strong = rows[density[rows] > 0.4 * density[rows].max()]
-    return float(grid[strong[-1]]) if len(strong) else None
+    rows = np.flatnonzero((density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:])) + 1
+    return grid[rows], density[rows]
 
 
 def _crossings(path_m: FloatArray, at_m: float, samples: PathSamples) -> tuple[FloatArray, IntArray, FloatArray]:
