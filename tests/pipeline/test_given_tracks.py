@@ -1,6 +1,7 @@
 """`velfield run --tracks`: tracks of a simulated flight in each format give the same field and answers as the truth."""
 
 import re
+import xml.etree.ElementTree as ET
 from functools import cache
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from flows.commands.run import run as run_command
 from flows.commands.verify import DAMAGED, WHOLE, verify
+from schemas.analysis import AnalysisRecord
 from schemas.export import ExportOptions
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job
@@ -19,6 +21,7 @@ from tests.small_flight import digests
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.exports.export import export_run
+from velfield.pipeline.analysis.analyse import analyse_tracks
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.pipeline.given_tracks.plan import plan_tracks
 from velfield.pipeline.given_tracks.write import at_frames
@@ -139,6 +142,41 @@ def test_the_run_has_its_vehicles_and_times(run: Run) -> None:
     assert vehicles["length_m"].to_numpy() == pytest.approx(
         lengths.reindex(names.reindex(vehicles["track_id"])).to_numpy(), abs=1e-3
     )
+
+
+def street(ids: list[str | int]) -> pd.DataFrame:
+    """A vehicle every 8 s drives along a street; the last one, in the middle of the time, against the others."""
+    rows, t = [], np.arange(0.0, 15.0, 0.2)
+    for k, one in enumerate(ids[:-1]):
+        rows.append(pd.DataFrame({"id": one, "time_s": 8 * k + t, "x_m": 10 * t, "y_m": 0.0}))
+    rows.append(pd.DataFrame({"id": ids[-1], "time_s": 52 + t, "x_m": 150 - 10 * t, "y_m": 0.0}))
+    return pd.concat(rows[::-1])
+
+
+@pytest.mark.parametrize("ids", [[*range(99, 60, -3), 64], [*(f"car.{k}" for k in range(13)), "bus & tram"]])
+def test_a_track_has_the_id_of_the_users_file_wherever_it_is_shown(ids: list[str | int], tmp_path: Path) -> None:
+    street(ids).to_csv(tmp_path / "t.csv", index=False)
+    lines = [*analyse_tracks(tmp_path / "t.csv", tmp_path / "out", gsd_m=None, fps=None, unit=None, y_axis="down")]
+    assert any(re.search(rf"wrong way at .* track {ids[-1]}\)", line) for line in lines)
+    record = AnalysisRecord.model_validate_json((tmp_path / "out" / "analysis.json").read_text())
+    unusual = next(table for table in record.tables if table.name == "unusual")
+    assert [row.cells["track"] for row in unusual.rows] == [ids[-1]]
+
+    run = process(tmp_path / "t.csv", tmp_path / "run", position_y_axis="down")
+    assert [run.analysis.trajectories.id_of(one.track) for one in run.analysis.traffic.unusual] == [ids[-1]]
+    assert set(pd.read_parquet(export_run(run, "trajectories"))["track_id"]) == set(ids)
+    assert set(pd.read_parquet(export_run(run, "geoparquet"))["track_id"]) == set(ids)
+    assert {one.get("id") for one in ET.parse(export_run(run, "sumo")).getroot().iter("vehicle")} == {*map(str, ids)}
+    numbers = {*ids} if isinstance(ids[0], int) else {*range(1, 15)}
+    for form, column in (("highd", "id"), ("geotrax", "Vehicle_ID")):
+        assert set(pd.read_csv(export_run(run, form))[column]) == numbers
+
+
+def test_an_id_that_comes_back_is_of_a_second_vehicle_with_a_name_of_its_own(tmp_path: Path) -> None:
+    again = street([1, 2, 3]).assign(time_s=lambda t: t["time_s"] + 600.0)
+    pd.concat([street([1, 2, 3]), again[again["id"] == 2]]).to_csv(tmp_path / "t.csv", index=False)
+    loaded = load_tracks(tmp_path / "t.csv", FlightConfig(position_y_axis="down"))
+    assert sorted(loaded.names) == ["1", "2", "2 (2)", "3"]
 
 
 def test_the_flow_writes_the_same_bits_and_repairs_what_was_damaged(run: Run, server: None, tmp_path: Path) -> None:

@@ -245,7 +245,8 @@ def test_two_hundred_tables_by_rule_are_right_or_not_without_a_word(tmp_path: Pa
         if said or loaded is None:
             continue
         xy = loaded.xy_m - loaded.xy_m.min(axis=0)
-        found = pd.Series(xy[:, 0]).groupby(loaded.table["source_id"].to_numpy()).agg(lambda x: x.iloc[-1] - x.iloc[0])
+        names = loaded.names.reindex(loaded.table["track_id"]).to_numpy()
+        found = pd.Series(xy[:, 0]).groupby(names).agg(lambda x: x.iloc[-1] - x.iloc[0])
         assert sorted(found) == pytest.approx(sorted(truth), abs=1.0), name
         assert np.corrcoef(np.sin(xy[:, 0] / 50), xy[:, 1])[0, 1] > 0.98, name  # y down
         right += 1

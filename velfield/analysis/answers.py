@@ -307,9 +307,9 @@ def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
 
 
 def _unusual(analysis: TrafficAnalysis) -> Answer:
-    ids = analysis.trajectories.track_id
+    tracks = analysis.trajectories
     first = "; ".join(
-        f"{u.kind} at {u.time_s:.1f} s (frame {u.frame}, track {ids[u.track]}): {u.detail}"
+        f"{u.kind} at {u.time_s:.1f} s (frame {u.frame}, track {tracks.id_of(u.track)}): {u.detail}"
         for u in analysis.unusual[:3]
     )
     return _events("unusual", analysis, len(analysis.unusual), first)

@@ -1,12 +1,14 @@
 """Trajectories: the tracks of a flight as flat arrays in metres, smoothed, and resampled along their paths."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.compiled import kernel
@@ -27,6 +29,8 @@ positions differ from that by more than this."""
 _ALIGNED_SD_PX = 0.5
 """A displacement with a larger standard deviation is that of two detections, whose crops did not align."""
 _THREADS = 2
+TrackId = int | str
+"""The id of a track: a whole number, or the text of the user's file."""
 MOVES_M = 6.0
 """Least extent of a vehicle's path for it to be in the analysis."""
 SAMPLES_M = 1.0
@@ -40,7 +44,7 @@ class Trajectories:
     """Tracks as flat arrays: track k has the rows ``first[k]:first[k + 1]``, in time order."""
 
     track_id: IntArray
-    """(n,) ids of the tracks."""
+    """(n,) numbers of the tracks."""
     first: IntArray
     """(n + 1,) rows."""
     frame: IntArray
@@ -59,6 +63,8 @@ class Trajectories:
     """(k, 2) begins and ends of longer times without frames, as between clips, in time order; None: there are none."""
     seen_s: tuple[float, float] | None = None
     """Times of the first and the last frame; None: not known, those of the first and the last position."""
+    source_id: Mapping[int, TrackId] | None = None
+    """Ids of the tracks in the file of another program, by ``track_id``; None: they have no others."""
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -66,6 +72,17 @@ class Trajectories:
     def __iter__(self) -> Iterator[slice]:
         for a, b in zip(self.first[:-1], self.first[1:], strict=True):
             yield slice(int(a), int(b))
+
+    def id_of(self, track: int) -> TrackId:
+        """The id by which people know a track, by its row in ``track_id``: the one of the user's file, if there is
+        one."""
+        number = int(self.track_id[track])
+        return number if self.source_id is None else self.source_id[number]
+
+    @property
+    def ids(self) -> NDArray[np.generic]:
+        """(n,) `id_of` of each track."""
+        return self.track_id if self.source_id is None else np.array([self.id_of(k) for k in range(len(self))])
 
     @property
     def owner(self) -> IntArray:
@@ -141,7 +158,20 @@ class Trajectories:
             self.position_sd_m,
             self.gaps_s,
             self.seen_s,
+            self.source_id,
         )
+
+
+def read_ids(track_id: IntArray, names: Sequence[str]) -> dict[int, TrackId]:
+    """Ids of tracks by their numbers, of names in a file: whole numbers where all are, else text.
+
+    Examples
+    --------
+    >>> read_ids(np.array([0, 1]), ["64", "7"]), read_ids(np.array([0, 1]), ["64", "car.7"])
+    ({0: 64, 1: 7}, {0: '64', 1: 'car.7'})
+    """
+    whole = all(re.fullmatch(r"-?(0|[1-9]\d*)", name) for name in names)
+    return {int(k): int(name) if whole else name for k, name in zip(track_id, names, strict=True)}
 
 
 def moving(trajectories: Trajectories) -> Trajectories:

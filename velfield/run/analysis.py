@@ -1,6 +1,6 @@
 """`Run.analysis`: the analyses of `velfield.analysis` on the stored layers and tracks of a run, lengths in metres."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +18,7 @@ from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.regions import Regions
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.trajectories import Trajectories, from_tracklets, moving
+from velfield.analysis.trajectories import TrackId, Trajectories, from_tracklets, moving
 from velfield.analysis.vehicle_classes import VehicleClasses, find_classes
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad
@@ -51,6 +51,8 @@ class RunAnalysis:
         Standard deviation of a position along one axis, of tracks of another program.
     frame_times
         Returns the times (n,) of the registered frames, s; None: not known.
+    source_ids
+        Ids of the tracks in the user's file, by ``track_id``; None: they have no others.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
@@ -61,12 +63,13 @@ class RunAnalysis:
     vehicles: Callable[[], pd.DataFrame]
     position_sd_m: float
     frame_times: Callable[[], FloatArray] | None
+    source_ids: Mapping[int, TrackId] | None = None
 
     @cached_property
     def trajectories(self) -> Trajectories:
         """Tracks of vehicles that move, in metres."""
         made = from_tracklets(self.tracklets(), self.gsd_m)
-        known = self._with_frames(replace(made, position_sd_m=self.position_sd_m))
+        known = self._with_frames(replace(made, position_sd_m=self.position_sd_m, source_id=self.source_ids))
         return moving(known).with_lengths(self.dimensions())
 
     @cached_property

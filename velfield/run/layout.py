@@ -166,6 +166,8 @@ class RunLayout:
     """Candidates of a lower score than a detection's, which tracks can confirm."""
     dimensions = _Inside("tracks/dimensions.parquet")
     """Dimensions of the vehicles, a row a track."""
+    source_ids = _Inside("tracks/source_ids.csv")
+    """The id of each track in the user's file, of tracks that were given."""
     track_positions = _Inside("tracks/positions")
     """Where each track's vehicle was in each frame, by unit."""
     doubtful = _Inside("tracks/doubtful")

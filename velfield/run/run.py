@@ -1,6 +1,6 @@
 """`open_run`: one object over a run folder, the Python side of the contract of outputs."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from schemas.tables import (
     TRACK_POSITION_COLUMNS,
 )
 from velfield.analysis.crossings import find_crossings, hysteresis_px
+from velfield.analysis.trajectories import TrackId, read_ids
 from velfield.analysis.vehicle_classes import add_dimensions
 from velfield.analysis.vehicles import VEHICLE_COLUMNS, find_vehicles
 from velfield.errors import InputError
@@ -271,6 +272,20 @@ class Run:
         table = read_tables(self.layout.unit_files(self.layout.track_positions), TRACK_POSITION_COLUMNS)
         return table.assign(source=pd.Categorical.from_codes(table["source"], pd.Index(POSITION_SOURCES)))
 
+    @cached_property
+    def source_ids(self) -> Mapping[int, TrackId] | None:
+        """Ids of the tracks in the file that they were given in, by ``track_id``; None of a run with frames."""
+        path = self.layout.source_ids
+        if not path.exists():
+            return None
+        table = pd.read_csv(path, dtype={"track_id": np.int64, "source_id": str}, keep_default_na=False)
+        return read_ids(table["track_id"].to_numpy(np.int64), table["source_id"].tolist())
+
+    def with_source_ids(self, table: pd.DataFrame) -> pd.DataFrame:
+        """A table with the `source_ids` as its ``track_id``, where there are such."""
+        ids = self.source_ids
+        return table if ids is None else table.assign(track_id=table["track_id"].map(ids))
+
     def joins(self) -> pd.DataFrame:
         """Joins of tracks over gaps, each with the probability that it is right: ``schemas.tables.JOIN_COLUMNS``."""
         return read_tables([self.layout.joins] if self.layout.joins.exists() else [], JOIN_COLUMNS)
@@ -319,6 +334,7 @@ class Run:
             self.vehicles,
             position_sd_m,
             self._registered_s if self.has_frames else None,
+            self.source_ids,
         )
 
     def _registered_s(self) -> FloatArray:

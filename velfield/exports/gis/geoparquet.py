@@ -24,7 +24,7 @@ _LINE_STRING = 2
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    return tracklets_geoparquet(run.tracklets(), Georeference.from_grid(run.grid))
+    return tracklets_geoparquet(run.with_source_ids(run.tracklets()), Georeference.from_grid(run.grid))
 
 
 def tracklets_geoparquet(tracklets: pd.DataFrame, georeference: Georeference) -> bytes:

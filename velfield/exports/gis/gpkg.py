@@ -19,7 +19,7 @@ _BASE_PIXELS = 'LOCAL_CS["Base pixels, y upwards",UNIT["pixel",1],AXIS["X",EAST]
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    return tracklets_gpkg(run.tracklets(), Georeference.from_grid(run.grid))
+    return tracklets_gpkg(run.with_source_ids(run.tracklets()), Georeference.from_grid(run.grid))
 
 
 def tracklets_gpkg(tracklets: pd.DataFrame, georeference: Georeference) -> bytes:

@@ -20,7 +20,7 @@ _LENGTH_M, _WIDTH_M = 4.5, 1.8
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    return highd_csv(trajectory_table(run)).encode()
+    return highd_csv(trajectory_table(run, whole=True)).encode()
 
 
 def highd_csv(table: pd.DataFrame) -> str:
@@ -29,10 +29,9 @@ def highd_csv(table: pd.DataFrame) -> str:
     c, s = np.abs(np.cos(angle)), np.abs(np.sin(angle))
     along, across = table["length_m"].fillna(_LENGTH_M), table["width_m"].fillna(_WIDTH_M)
     width, height = along * c + across * s, along * s + across * c
-    numbers = pd.factorize(table["track_id"], sort=True)[0] + 1
     columns = {
         "frame": table["frame"],
-        "id": numbers,
+        "id": table["track_id"],
         "x": table["x_m"] - width / 2,
         "y": table["y_m"] - height / 2,
         "width": width,

@@ -8,6 +8,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.flow.volume import lane_flow
+from velfield.analysis.trajectories import TrackId
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
 from velfield.exports.roads.parts import cut_at_intersections
@@ -40,7 +41,7 @@ class RoadLane:
 class Trip:
     """A vehicle that drove along connected lanes, from a time in s since the first track's."""
 
-    track_id: int
+    track_id: TrackId
     depart_s: float
     lanes: tuple[int, ...]
     speed_m_per_s: float
@@ -93,7 +94,7 @@ def road_network(run: Run) -> RoadNetwork:
     samples, connections = parts.graph.samples, parts.connections
     first_s = float(trajectories.time_s.min()) if len(trajectories.time_s) else 0.0
     trips = _trips(samples.track, samples.lane, samples.time_s - first_s, samples.speed_m_per_s, set(connections))
-    named = tuple(replace(trip, track_id=int(trajectories.track_id[trip.track_id])) for trip in trips)
+    named = tuple(replace(trip, track_id=trajectories.id_of(int(trip.track_id))) for trip in trips)
     signalised = frozenset(number for number in meet if traffic.is_signalised(number))
     return RoadNetwork(tuple(lanes), connections, named, float(np.diff(trajectories.window_s)[0]), signalised)
 
@@ -121,4 +122,4 @@ def _trips(
         first, last = max(pairwise(cuts), key=lambda part: ends[part[1]] - ends[part[0]])
         row = rows[starts[first]]
         trips.append(Trip(int(number), float(time_s[row]), tuple(visited[first:last]), float(speed[row])))
-    return sorted(trips, key=lambda trip: (trip.depart_s, trip.track_id))
+    return sorted(trips, key=lambda trip: trip.depart_s)

@@ -30,7 +30,7 @@ _TURNS_M_PER_S = 1.0
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    table = trajectory_table(run)
+    table = trajectory_table(run, whole=True)
     size_m = np.array([run.grid.width_px, run.grid.height_px]) * run.gsd_m
     table["y_m"] = size_m[1] - table["y_m"]
     table[["vy_m_per_s", "ay_m_per_s2"]] *= -1
@@ -55,7 +55,7 @@ def _vehicle_records(table: pd.DataFrame) -> np.ndarray:
     length = table["length_m"].fillna(VEHICLE_LENGTH_M).to_numpy(np.float64)
     middle, half = table[["x_m", "y_m"]].to_numpy(np.float64), length[:, None] / 2 * way
     records = np.zeros(len(table), VEHICLE)
-    records["type"], records["id"] = 3, pd.factorize(table["track_id"], sort=True)[0] + 1
+    records["type"], records["id"] = 3, table["track_id"]
     records["link"], records["lane"] = table["lane"] + 1, table["lane"] >= 0
     records["front"], records["rear"] = middle + half, middle - half
     records["length"], records["width"] = length, table["width_m"].fillna(VEHICLE_WIDTH_M)

@@ -131,7 +131,7 @@ def _routes_xml(network: RoadNetwork) -> str:
     for trip in network.trips:
         edges = " ".join(name[number] for number in trip.lanes)
         rows.append(
-            f'<vehicle id="{trip.track_id}" type="car" depart="{trip.depart_s:.2f}" departSpeed="max">'
+            f'<vehicle id={quoteattr(str(trip.track_id))} type="car" depart="{trip.depart_s:.2f}" departSpeed="max">'
             f'<route edges="{edges}"/></vehicle>'
         )
     return _document("routes", rows)

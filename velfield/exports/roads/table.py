@@ -4,13 +4,19 @@ import numpy as np
 import pandas as pd
 
 from velfield.exports.georeference import Georeference
+from velfield.exports.tracks.points import whole_ids
 from velfield.run.run import Run
 
 _OF_VEHICLES = ["length_m", "width_m", "vehicle_class", "class_probability"]
 
 
-def trajectory_table(run: Run) -> pd.DataFrame:
+def trajectory_table(run: Run, *, whole: bool = False) -> pd.DataFrame:
     """Trajectories of the vehicles that move.
+
+    Parameters
+    ----------
+    whole
+        ``track_id`` is a whole number, by `whole_ids`; else as in the user's file, of tracks that were given.
 
     Returns
     -------
@@ -27,7 +33,8 @@ def trajectory_table(run: Run) -> pd.DataFrame:
     """
     gsd_m = run.gsd_m
     paths, samples = run.analysis.trajectories, run.analysis.lanes().samples
-    owner = paths.owner
+    owner, numbers = paths.owner, whole_ids(run, paths.track_id)
+    ids = np.array([numbers[k] for k in paths.track_id.tolist()], np.int64) if whole else paths.ids
     acceleration = np.zeros_like(paths.velocity_m_per_s)
     lane = np.full(len(owner), -1, np.int64)
     for number, rows in enumerate(paths):
@@ -42,7 +49,7 @@ def trajectory_table(run: Run) -> pd.DataFrame:
     georeference = Georeference.from_grid(run.grid)
     table = pd.DataFrame(
         {
-            "track_id": paths.track_id[owner],
+            "track_id": ids[owner],
             "frame": paths.frame,
             "time_s": paths.time_s,
             "x_m": paths.xy_m[:, 0],

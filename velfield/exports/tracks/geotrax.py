@@ -10,7 +10,7 @@ from rasterio.warp import transform
 from schemas.arrays import Points
 from schemas.export import ExportOptions
 from velfield.exports.georeference import MPS_TO_KMH, Georeference
-from velfield.exports.tracks.points import track_points
+from velfield.exports.tracks.points import track_points, whole_ids
 from velfield.run.run import Run
 from velfield.sources.geo import utm_crs
 
@@ -21,7 +21,10 @@ _SAME = 0.01
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    return geotrax_csv(run.tracklets(), Georeference.from_grid(run.grid), run.vehicles()).encode()
+    tracklets, vehicles = run.tracklets(), run.vehicles()
+    ids = whole_ids(run, tracklets["track_id"])
+    tracklets, vehicles = (one.assign(track_id=one["track_id"].map(ids)) for one in (tracklets, vehicles))
+    return geotrax_csv(tracklets, Georeference.from_grid(run.grid), vehicles).encode()
 
 
 def geotrax_table(
@@ -58,7 +61,7 @@ def geotrax_table(
         dimensions = measured.reindex(points["track_id"]).to_numpy(np.float64)
     return pd.DataFrame(
         {
-            "Vehicle_ID": points["track_id"].rank(method="dense").astype("int64"),
+            "Vehicle_ID": points["track_id"],
             "Timestamp": points["time_s"],
             "Frame_Number": points["frame"],
             "Ortho_X": points["x_px"],

@@ -36,7 +36,7 @@ def encode(run: Run, _path: Path, options: ExportOptions) -> bytes:
         features.append(
             {
                 "type": "Feature",
-                "properties": {"track_id": int(paths.track_id[number])},
+                "properties": {"track_id": paths.id_of(number)},
                 "temporalGeometry": point,
                 "temporalProperties": [{"datetimes": when, "speed": speed}],
             }

@@ -1,6 +1,21 @@
 """Tracks of the vehicles for other programs: one row a vehicle and frame."""
 
+from collections.abc import Iterable
+
 import pandas as pd
+
+from velfield.run.run import Run
+
+_MOST_ID = 2**31
+
+
+def whole_ids(run: Run, track_id: Iterable[int]) -> dict[int, int]:
+    """Ids by ``track_id`` for formats that have whole numbers alone: those of the user's file, else 1, 2, ..., in the
+    order of the tracks, where it has none or others than whole numbers."""
+    tracks, own = sorted({int(k) for k in track_id}), run.source_ids or {}
+    ids = [own.get(k) for k in tracks]
+    whole = {k: one for k, one in zip(tracks, ids, strict=True) if isinstance(one, int) and 0 <= one < _MOST_ID}
+    return whole if len(whole) == len(tracks) else {k: number for number, k in enumerate(tracks, 1)}
 
 
 def track_points(tracklets: pd.DataFrame) -> pd.DataFrame:

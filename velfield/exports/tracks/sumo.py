@@ -1,6 +1,7 @@
 """SUMO floating car data: the position of each vehicle at each time, for SUMO's tools."""
 
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,7 @@ FILE_NAME = "tracks.fcd.xml"
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    return sumo_fcd(run.tracklets(), Georeference.from_grid(run.grid)).encode()
+    return sumo_fcd(run.with_source_ids(run.tracklets()), Georeference.from_grid(run.grid)).encode()
 
 
 def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference) -> str:
@@ -53,7 +54,7 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference) -> str:
         lines.append(f'    <timestep time="{float(str(time_s)) - start_s:.3f}">')
         for k in rows:
             lines.append(
-                f'        <vehicle id="{numbers[k]}" x="{metres[k, 0]:.2f}" y="{metres[k, 1]:.2f}" '
+                f'        <vehicle id={quoteattr(str(numbers[k]))} x="{metres[k, 0]:.2f}" y="{metres[k, 1]:.2f}" '
                 f'angle="{angle[k]:.2f}" type="car" speed="{speed[k]:.2f}"/>'
             )
         lines.append("    </timestep>")

@@ -15,7 +15,7 @@ from velfield.analysis.answers import explain_none, find_answers
 from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.trajectories import make_trajectories, moving
+from velfield.analysis.trajectories import make_trajectories, moving, read_ids
 from velfield.analysis.vehicle_classes import find_classes
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
@@ -141,7 +141,8 @@ def analyse_tracks(
     ids, frames = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
     time_s = table["time_s"].to_numpy(np.float64)
     made = make_trajectories(ids, frames, time_s, given.xy_m, gsd_m=given.gsd_m, position_sd_m=given.position_sd_m)
-    made = replace(made, seen_s=made.window_s)  # with those that stand
+    source_id = read_ids(given.names.index.to_numpy(np.int64), given.names.tolist())
+    made = replace(made, seen_s=made.window_s, source_id=source_id)  # the time with those that stand
     tracks = moving(
         replace(made, measured_length_m=given.sizes_m(made.track_id)[:, 0]) if "length_m" in table else made
     )

@@ -167,7 +167,7 @@ def approach_table(analysis: TrafficAnalysis) -> AnalysisTable:
 def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """U-turns."""
     columns: list[Column[Reversal]] = [
-        Column("track", "Track", "", lambda found: _track_id(analysis, found.track)),
+        Column("track", "Track", "", lambda found: analysis.trajectories.id_of(found.track)),
         Column("time", "Time", "s", lambda found: found.time_s, 1),
         Column("side", "To the", "", lambda found: "left" if found.left else "right"),
     ]
@@ -292,8 +292,8 @@ def conflict_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Conflicts."""
     columns: list[Column[Conflict]] = [
         Column("kind", "Kind", "", lambda c: c.kind),
-        Column("first", "First track", "", lambda c: _track_id(analysis, c.first)),
-        Column("second", "Second track", "", lambda c: _track_id(analysis, c.second)),
+        Column("first", "First track", "", lambda c: analysis.trajectories.id_of(c.first)),
+        Column("second", "Second track", "", lambda c: analysis.trajectories.id_of(c.second)),
         Column("time", "Time", "s", lambda c: c.time_s, 1),
         Column("value", "Time to collision, or post-encroachment time", "s", lambda c: c.value_s, 2),
         Column("sd", "Standard deviation", "s", lambda c: c.sd_s, 2),
@@ -311,7 +311,7 @@ def unusual_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Unusual tracks."""
     columns: list[Column[Unusual]] = [
         Column("kind", "Kind", "", lambda u: u.kind),
-        Column("track", "Track", "", lambda u: _track_id(analysis, u.track)),
+        Column("track", "Track", "", lambda u: analysis.trajectories.id_of(u.track)),
         Column("frame", "Frame", "", lambda u: u.frame),
         Column("time", "Time", "s", lambda u: u.time_s, 1),
         Column("detail", "What", "", lambda u: u.detail),
@@ -329,10 +329,6 @@ def doubtful_table(analysis: TrafficAnalysis) -> AnalysisTable:
     title, rows = "Places where false motion is likely", analysis.doubtful_places
     note = "Squares of 12 m in which most tracks are shorter than 15 m, as false ones in dense car parks are."
     return make_table(analysis, "doubtful", "Unusual", title, note, columns, rows, lambda at: at.xy_m)
-
-
-def _track_id(analysis: TrafficAnalysis, track: int) -> int:
-    return int(analysis.trajectories.track_id[track])
 
 
 def _numbers(numbers: Iterable[int]) -> str:

@@ -34,8 +34,10 @@ class LoadedTracks:
     """Tracks of a file on a grid of base pixels."""
 
     table: pd.DataFrame
-    """``track_id, source_id, frame, time_s, x_px, y_px``, smoothed, by track and time; and ``length_m``, ``width_m``
-    where the file has them."""
+    """``track_id, frame, time_s, x_px, y_px``, smoothed, by track and time; and ``length_m``, ``width_m`` where the
+    file has them."""
+    names: pd.Series
+    """Name of each track in the file, by ``track_id``; ``NAME (2)`` of the second part of one that was cut."""
     shape: tuple[int, int]
     gsd_m: float
     """(height, width) of the grid, px, and metres a pixel."""
@@ -110,6 +112,7 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     clean = clean_tracks(table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64), xy_m)
     x_px, y_px = (clean.xy_m / gsd_m).T
     table = table.assign(track_id=clean.track, x_px=x_px, y_px=y_px)
+    names = _names(table)
     notes += check_standing_gaps(table, clean.xy_m) + _check_accelerations(table, clean.xy_m, gsd_m)
     displacement_sd_m = max(LEAST_ERROR_M, clean.velocity_sd_m_per_s * own_step_s(table))
     crs_wkt, affine = (raster.crs_wkt, raster.affine) if raster is not None else (None, None)
@@ -121,7 +124,15 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     north_rad = -np.pi / 2 if given.y_is_north else None
     if crs_wkt is not None and affine is not None:
         north_rad = true_north_rad(crs_wkt, affine, shape, name=path.name)
-    return LoadedTracks(table, shape, gsd_m, raster, crs_wkt, affine, north_rad, *errors, tuple(notes))
+    table = table.drop(columns="source_id")
+    return LoadedTracks(table, names, shape, gsd_m, raster, crs_wkt, affine, north_rad, *errors, tuple(notes))
+
+
+def _names(table: pd.DataFrame) -> pd.Series:
+    """Unique names of tracks, by ``track_id``: parts of one track of the file are numbered in the order of time."""
+    names = table.drop_duplicates("track_id").set_index("track_id")["source_id"]
+    part = names.groupby(names).cumcount() + 1
+    return names.where(part == 1, names + " (" + part.astype(str) + ")")
 
 
 def _check_accelerations(table: pd.DataFrame, xy_m: FloatArray, gsd_m: float) -> list[str]:

@@ -218,8 +218,7 @@ def _write_tables(plan: Plan, given: LoadedTracks, positions: pd.DataFrame, trac
     ):
         write_table(path, table, columns)
         written.append(path)
-    names = given.table.drop_duplicates("track_id").set_index("track_id")["source_id"]
-    listed = first[["track_id", "given_id"]].assign(source_id=names.reindex(first["given_id"]).to_numpy())
-    written.append(layout.tracks / "source_ids.csv")
+    listed = first[["track_id", "given_id"]].assign(source_id=given.names.reindex(first["given_id"]).to_numpy())
+    written.append(layout.source_ids)
     write_atomically(written[-1], listed[["track_id", "source_id"]].to_csv(index=False, lineterminator="\n").encode())
     return written
