@@ -47,5 +47,6 @@ def demo(
         if not quiet:
             print(f"the map:    {own_command()} view {shlex.quote(str(run))}")
             print(f"the report: {run / 'analysis' / 'report.html'}")
+            print(f"minutes of traffic: {own_command()} simulate MINUTES --tracks 6")
             print(f"your own clip: {own_command()} run VIDEO --out RUN")
     return status

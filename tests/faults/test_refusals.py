@@ -67,6 +67,8 @@ def command(
         (("simulate", "out", "--frames", "0"), 1, "--frames 0: input should be greater than 0 (number of frames)"),
         (("simulate", "out", "--frames", "-5"), 1, "--frames -5: input should be greater than 0"),
         (("simulate", "out", "--size", "640x20"), 1, "--size 640x20: input should be greater than or equal to 64 (he"),
+        (("simulate", "out", "--tracks", "0"), 1, "--tracks 0: input should be greater than 0"),
+        (("simulate", "out", "--tracks", "2", "--clip", "beside"), 1, "--tracks writes no frames; leave out --clip"),
         (("simulate", "out", "--seed", "-1"), 1, "--seed -1: input should be greater than or equal to 0"),
         (("demo", "--out", "out", "--frames", "0"), 1, "--frames 0: input should be greater than 0"),
         (("demo", "--out", "out", "--size", "10x10"), 1, "--size 10x10: input should be greater than or equal to 64"),

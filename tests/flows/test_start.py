@@ -85,3 +85,14 @@ def test_the_page_of_an_analysed_run_opens_with_the_answers(tmp_path: Path, monk
     (tmp_path / "analysis" / "analysis.json").touch()
     view(tmp_path)
     assert starts == ["", "#tab=analysis"]
+
+
+def test_simulated_tracks_are_analysed_by_the_command_that_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = {"result_action": "return_value", "exit_on_error": False}
+    assert app(["simulate", str(tmp_path / "two minutes"), "--tracks", "2", "--size", "800x600"], **options) == 0
+    found, line = capsys.readouterr().out.splitlines()
+    vehicles = int(found.split(": ")[1].removesuffix(" vehicles"))
+    assert app(["analyse", *shlex.split(line.partition(" analyse ")[2])], **options) == 0
+    assert f"y down; times: time_s (s); {vehicles} vehicles" in capsys.readouterr().out

@@ -14,6 +14,7 @@ from velfield.errors import InputError
 from velfield.parallel import map_ahead
 from velfield.synthetic.clip import open_clip, simulate_telemetry
 from velfield.synthetic.flight import Flight
+from velfield.synthetic.observed import observed_detections
 from velfield.synthetic.truth import make_truth, save_truth
 
 _RENDERED_AHEAD = 4
@@ -52,6 +53,24 @@ def write_flight(out: Path, config: SimulationConfig, progress: Callable[[int, i
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return flight
+
+
+def write_tracks(path: Path, config: SimulationConfig) -> int:
+    """Write what a tracker sees of all vehicles as CSV, without rendering a frame; returns the number of vehicles.
+
+    Columns ``id, frame, time_s, x_m, y_m, length_m, width_m``, y down, with `velfield.synthetic.observed.Errors`.
+    """
+    flight = Flight(config)
+    traffic, rng = flight.city.traffic, np.random.default_rng(config.seed)
+    seen = observed_detections(traffic, flight.times_s, flight.city.to_px, shape=flight.base_shape, rng=rng)
+    vehicle = seen["vehicle_id"].to_numpy(np.int64)
+    xy_m = seen[["x_px", "y_px"]].to_numpy(np.float64) * config.gsd_m
+    table = pd.DataFrame({"id": vehicle, "frame": seen["frame"], "time_s": seen["time_s"]})
+    size = traffic.dimensions
+    table = table.assign(x_m=xy_m[:, 0], y_m=xy_m[:, 1], length_m=size.length_m[vehicle], width_m=size.width_m[vehicle])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table.sort_values(["id", "frame"]).round(3).to_csv(path, index=False)
+    return len(np.unique(vehicle))
 
 
 def _write_frames(out: Path, flight: Flight, names: list[str], pool: ThreadPoolExecutor) -> Iterator[None]:
