@@ -112,6 +112,21 @@ def test_a_junction_reaches_to_where_its_lanes_have_parted() -> None:
     assert np.hypot(*np.subtract(*out)) > 3.0
 
 
+@pytest.mark.parametrize("lanes_straight_on", [1, 2])
+def test_the_far_lanes_of_a_t_junction_are_of_it(lanes_straight_on: int) -> None:
+    """From E a left turn has a lane of its own across those from W; beside it nothing meets those straight on."""
+    west = AVENUE[::-1] - np.array([0.0, 3.5])
+    left = np.concatenate([[[150.0, 46.5], [90.0, 46.5]], arc((90.0, 60.5), 14.0, -90, -180), [[76.0, 150.0]]])
+    joins = np.concatenate([[[82.0, 150.0]], arc((98.0, 66.0), 16.0, 180, 270), [[150.0, 50.0]]])
+    paths = [AVENUE] * 9 + [left] * 5 + [joins] * 4
+    paths += [west - [0.0, 3.5 * k] for k in range(1, lanes_straight_on + 1) for _ in range(6)]
+    (found,) = TrafficAnalysis(tracks_of([driven(path) for path in paths])).movements
+    counts = {(m.arm_in, m.arm_out): m.seen for m in found.movements}
+    assert counts == {("W", "E"): 9, ("E", "S"): 5, ("S", "E"): 4, ("E", "W"): 6 * lanes_straight_on}
+    share = next(m.share for m in found.movements if m.arm_out == "S")
+    assert share.value == pytest.approx(5 / (5 + 6 * lanes_straight_on))
+
+
 def test_lanes_of_one_direction_are_neighbours(avenue: LaneGraph) -> None:
     lane = max((lane for lane in avenue if lane.width_source == "neighbour"), key=lambda lane: lane.length_m)
     assert lane.width_m == pytest.approx(3.5, abs=0.35)

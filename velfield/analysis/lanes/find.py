@@ -9,7 +9,7 @@ from schemas.analysis import Turn, WidthSource
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.lanes.graph import Chains, count_links, link_chains, make_chains, number_chains
 from velfield.analysis.lanes.junctions import find_junctions
-from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples
+from velfield.analysis.lanes.model import LANE_MAX_M, Connection, Lane, LaneGraph, LaneSamples
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
 from velfield.analysis.lanes.turns import add_turns
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, group_rows, sample_paths
@@ -17,8 +17,8 @@ from velfield.compiled import kernel
 
 MIN_TRACKS = 3
 """A lane, or a connection, that fewer tracks drove is not one: an error of tracking or of a driver."""
-_LANE_MIN_M, _LANE_MAX_M = 2.2, 5.0
-"""Distances between neighbouring lanes of one carriageway."""
+_LANE_MIN_M = 2.2
+"""Neighbouring lanes of one carriageway are at least so far apart."""
 _MARGIN_M = 0.6
 """To either side of a car, where a lane's width is taken from the spread of paths."""
 _TURN_RAD, _U_TURN_RAD = np.radians(40), np.radians(150)
@@ -218,7 +218,7 @@ def _neighbours(lines: list[FloatArray]) -> dict[tuple[int, int], tuple[int, flo
     points = np.concatenate(lines)
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     direction = np.concatenate([np.arctan2(*np.gradient(line, axis=0).T[::-1]) for line in lines])
-    pairs = cKDTree(points).query_pairs(_LANE_MAX_M, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(LANE_MAX_M, output_type="ndarray")
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]]
     a, b = pairs.T

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from schemas.analysis import JunctionKind
 from schemas.arrays import FloatArray, IntArray, Mask
-from velfield.analysis.lanes.model import Connection, Junction, Lane
+from velfield.analysis.lanes.model import LANE_MAX_M, Connection, Junction, Lane
 
 _NEAR_M = 15.0
 """Meeting points nearer to each other are of one junction: a median is up to 14 m wide."""
@@ -43,6 +43,8 @@ def find_junctions(lanes: Sequence[Lane], connections: Sequence[Connection]) -> 
         if kind in ("merge", "diverge"):
             xy = np.concatenate([xy, _parted(xy, lanes, connections)])
         hull = _with_whole_lanes(buffered_hull(xy, _MARGIN_M), lanes)
+        if kind in ("intersection", "crossing"):
+            hull = _with_lanes_beside(hull, lanes)
         lanes_in, lanes_out, inside_ = _members(lanes, hull)
         made.append(
             Junction(
@@ -86,6 +88,37 @@ def _with_whole_lanes(hull_m: FloatArray, lanes: Sequence[Lane]) -> FloatArray:
         points += [lane.xy_m[inside] - across, lane.xy_m[inside] + across]
     every = np.concatenate(points)
     return np.asarray(every[ConvexHull(every).vertices])
+
+
+def _with_lanes_beside(hull_m: FloatArray, lanes: Sequence[Lane]) -> FloatArray:
+    """The hull (n, 2), widened by the lanes of the same carriageways that run past it.
+
+    At a T-junction nothing crosses the far lane straight on: its vehicles stop at one line with those that turn.
+    """
+    beside = {(lane.number, other) for lane in lanes for other in (lane.left, lane.right) if other is not None}
+    beside |= {(b, a) for a, b in beside}
+    while True:
+        touches = [inside_hull(lane.xy_m, hull_m).any() for lane in lanes]
+        near = {b for a, b in beside if touches[a] and not touches[b] and _near(lanes[a], lanes[b], hull_m)}
+        past = [part for k in sorted(near) if len(part := _part_past(lanes[k], hull_m))]
+        if not past:
+            return hull_m
+        every = np.concatenate([hull_m, *(buffered_hull(part, _HALF_LANE_M) for part in past)])
+        hull_m = _with_whole_lanes(every[ConvexHull(every).vertices], lanes)
+
+
+def _near(lane: Lane, other: Lane, hull_m: FloatArray) -> bool:
+    """Whether two neighbouring lanes are a lane apart where the first comes to the hull (n, 2), or has left it."""
+    at = lane.along_m[inside_hull(lane.xy_m, hull_m)]
+    near = (lane.along_m > at[0] - _PARTING_M) & (lane.along_m < at[-1] + _PARTING_M)
+    return bool(np.min(cKDTree(other.xy_m).query(lane.xy_m[near])[0]) < LANE_MAX_M)
+
+
+def _part_past(lane: Lane, hull_m: FloatArray) -> FloatArray:
+    """Points (k, 2) of a lane beside the hull (n, 2); none of one that begins behind it, or ends before it."""
+    along = np.asarray(cKDTree(lane.xy_m).query(hull_m)[1])
+    part = lane.xy_m[along.min() : along.max() + 1]
+    return part if lane.along_m[along.max()] - lane.along_m[along.min()] > LANE_MAX_M else part[:0]
 
 
 def _kind(kinds: IntArray) -> JunctionKind:

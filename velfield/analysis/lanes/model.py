@@ -9,6 +9,9 @@ import numpy as np
 from schemas.analysis import JunctionKind, Turn, WidthSource
 from schemas.arrays import FloatArray, IntArray
 
+LANE_MAX_M = 5.0
+"""Neighbouring lanes of the same direction are no farther apart."""
+
 
 @dataclass(frozen=True)
 class Lane:
