@@ -42,7 +42,7 @@ class Previews:
     console: Console
 
     urgent = False
-    """Whether the task under way is the first preview: a person waits for it."""
+    """Whether the task under way is a first preview that is quick to make: a person waits for it."""
 
     def __post_init__(self) -> None:
         # On S3 folders are not renamed in one step.
@@ -60,7 +60,7 @@ class Previews:
         if not self._first_tried:
             self._first_tried = True
             if self.plan.is_long and not self.plan.layout.report.exists():
-                self.urgent = True
+                self.urgent = self.plan.is_of_frames_alone
                 return lambda: self._make(self._show_first_frames)
         found = next((stage for stage in stages if stage.stage.name == "detections"), None)
         if found is None or not self._is_worth_it(found):

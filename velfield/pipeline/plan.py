@@ -81,6 +81,12 @@ class Plan:
         return self.frame_count * self.info.width * self.info.height / 1e6 >= LONG_MPX
 
     @property
+    def is_of_frames_alone(self) -> bool:
+        """Whether nothing is given that is in pixels of a frame, has a scale of its own, or takes training."""
+        given = self.job.inputs
+        return not (given.base or given.labels or given.detector or given.detections)
+
+    @property
     def unit_frames(self) -> int:
         """Frames a unit: depends on the flight alone, never on the number of workers."""
         setting = self.config.work.unit_frames

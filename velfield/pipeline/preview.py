@@ -98,7 +98,8 @@ def _first_plan(plan: Plan) -> Plan:
         inputs = {"detector": str(detector), "labels": None}
         record = InputsRecord.model_validate(record.model_dump() | {"detector": "shipped", "labels": None})
     first = _with_root(plan, **inputs)
-    config, reduction = first.config, _reduction(plan)
+    config = first.config
+    reduction = 2 if plan.is_of_frames_alone and plan.info.width * plan.info.height > _LARGE_PX else 1
     lens, base = config.lens, config.base
     # frames of a moment lie on each other with their distortion; on a given image they do not
     calibrate = lens.calibrate if plan.job.inputs.base else "never"
@@ -113,13 +114,6 @@ def _first_plan(plan: Plan) -> Plan:
     keys, indices = stage_keys(job.config, record), plan.indices[:FIRST_FRAMES]
     first = replace(first, job=job, indices=indices, inputs=record, keys=keys, reduction=reduction)
     return first.with_lost_units(["all other frames"])
-
-
-def _reduction(plan: Plan) -> int:
-    """Half the size for large frames, where nothing given is in pixels of a frame or at a scale of its own."""
-    given = plan.job.inputs
-    in_pixels = given.base or given.labels or given.detector or given.detections
-    return 2 if plan.info.width * plan.info.height > _LARGE_PX and not in_pixels else 1
 
 
 def _make(plan: Plan, stages: Sequence[str], compute: Compute) -> None:
