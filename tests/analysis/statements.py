@@ -120,7 +120,9 @@ def statements(analysis: TrafficAnalysis, truth: Truth, u_turns: tuple[set[int],
     """All statements of a clip; ``u_turns``: true tracks that reverse, seen whole, and in part."""
     numbers = true_numbers(analysis, truth.tracks)
     yield from _signals(analysis, truth)
-    yield from _u_turns(analysis, numbers, *u_turns)
+    circles = [turn.track for turn in truth.analysis.reversals if turn.round_circle]
+    round_circles = set(true_numbers(truth.analysis, truth.tracks)[circles].tolist())
+    yield from _u_turns(analysis, numbers, *(found | round_circles for found in u_turns))
     yield from _limits(analysis, truth)
     yield from _counts(analysis, truth)
     yield from _delays(analysis, truth)

@@ -1,5 +1,6 @@
 """Answers about constructed traffic: a signal of known cycle, turning counts, free flow, a U-turn, a wrong way."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -325,6 +326,27 @@ def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
     assert 0.5 < first.probability <= 1.0
 
 
+def test_who_leaves_a_roundabout_by_the_arm_of_entry_makes_a_u_turn() -> None:
+    """Three go round a ring of four arms, of 18 m radius, back to the west; eight each go straight on from each arm."""
+
+    def way(arm: int, parts: int) -> FloatArray:
+        begin, end = np.radians(90 * arm + 20), np.radians(90 * (arm + parts) - 20)
+        ring = 18.0 * np.column_stack([np.cos(t := np.linspace(begin, end, 60)), np.sin(t)])
+        out, into = (np.array([np.cos(a), np.sin(a)]) for a in np.radians([90 * (arm + parts), 90 * arm]))
+        side = 2.2 * np.array([[-into[1], into[0]], [out[1], -out[0]]])
+        return np.array([200.0, 150.0]) + np.vstack([120 * into + side[0], 32 * into + side[0], ring,
+                                                     32 * out + side[1], 120 * out + side[1]])  # fmt: skip
+
+    tracks = [drive(way(arm, 2), 40.0 * k + 10.0 * arm) for k in range(8) for arm in range(4)]
+    tracks += [drive(way(2, 4), 95.0 * k + 5.0) for k in range(3)]
+    analysis = TrafficAnalysis(gather(tracks))
+    assert [junction.kind for junction in analysis.lanes.junctions] == ["roundabout"]
+    assert [turn.track for turn in analysis.reversals] == [32, 33, 34]
+    assert [turn.left for turn in analysis.reversals] == [False] * 3  # y down: the circle is driven to the right
+    (answer,) = (a for a in find_answers(analysis) if a.topic == "u-turns")
+    assert re.fullmatch(r"3 seen, 3\d an hour \(\d+ to \d+\): 3 at junction 0", answer.text)
+
+
 def test_u_turns_that_the_ends_of_short_clips_cut_do_not_bias_their_rate() -> None:
     rng = np.random.default_rng(3)
     takes_s, clip_s, clips, per_s = 20.0, 60.0, 4000, 1 / 30
@@ -546,7 +568,7 @@ def test_an_unusual_track_is_named_as_in_the_file() -> None:
     tracks = [drive(EAST, 4.0 * k) for k in range(12)] + [drive(EAST[::-1], 20.0)]
     made = gather(tracks)
     named = replace(made, track_id=made.track_id * 7 + 100_000)
-    answer = next(a for a in find_answers(TrafficAnalysis(named)) if a.topic == "unusual")
+    answer = next(a for a in find_answers(TrafficAnalysis(named)) if a.topic == "wrong way")
     assert answer.state == "found"
     assert f"track {12 * 7 + 100_000})" in answer.text
     table = unusual_table(TrafficAnalysis(named))

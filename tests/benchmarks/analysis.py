@@ -261,7 +261,7 @@ def _u_turns(case: Case, found: TrafficAnalysis, results: Results) -> None:
     """U-turns between an avenue's lanes, of vehicles that were seen before the turn and after it."""
     true = true_u_turns(case)
     owner = case.tracks.drop_duplicates("track_id").set_index("track_id")["vehicle_id"]
-    reversed_ = [int(owner[found.trajectories.track_id[r.track]]) for r in found.reversals]
+    reversed_ = [int(owner[found.trajectories.track_id[r.track]]) for r in found.reversals if not r.round_circle]
     results.values["u-turns: true"].append(len(true))
     results.values["u-turns: found"].append(len(true & set(reversed_)))
     begun = true_u_turns(case, seen_m=0.0)

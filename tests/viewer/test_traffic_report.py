@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from schemas.analysis import AnalysisRecord, EstimateRecord
-from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, crossroads, drive, gather
-from velfield.analysis.answers import duration_text
+from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, corner, crossroads, drive, gather
+from velfield.analysis.answers import duration_text, find_answers
 from velfield.analysis.approaches import approach_delays, arms_without_delay, lane_names
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.tables import all_tables, flow_table, limit_table
@@ -80,6 +80,22 @@ def test_a_short_clip_is_answered_by_what_is_missing() -> None:
         (f"Not known: conflicts: none was seen in {seconds}, too short a time to say how rare they are.",),
     ]
     assert {d.name for d in traffic_diagrams(short, None)} <= {"place", "speed-profile"}
+
+
+def test_a_turn_that_two_of_many_take_is_rare_and_no_danger(analysis: TrafficAnalysis) -> None:
+    left = corner(140.0, 100.0, 220.0) * [1.0, -1.0] + [0.0, 200.0]
+    tracks = [*crossroads(), *(drive(left, 100.0 + 150.0 * k) for k in range(2))]
+    tracks += [drive(np.array([[150.0, 100.0], [150.0, 0.0]]), 30.0 * k) for k in range(4)]
+    rare = TrafficAnalysis(gather(tracks))
+    answers = dict(first_page(rare).answers)
+    assert any(
+        re.match(r"rare: from W to N: 2 of 6\d vehicles, at ", line) for line in answers["Where do vehicles go?"]
+    )
+    assert "from W to N" not in " ".join(answers["Where is it dangerous?"])
+    (answer,) = (a for a in find_answers(rare) if a.topic == "wrong way")
+    assert answer.state == "none"
+    (answer,) = (a for a in find_answers(analysis) if a.topic == "conflicts")
+    assert answer.text.startswith("none in 8.5 min on ways that three vehicles or more drive, so fewer than ")
 
 
 def test_rows_and_columns_without_a_number_are_one_line_of_the_report() -> None:

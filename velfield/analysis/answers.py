@@ -23,6 +23,7 @@ from velfield.analysis.movements.movements import MIN_DELAY_S, MIN_DELAYED, Junc
 from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s, least_green_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import MOVES_M, Trajectories
+from velfield.analysis.unusual import Unusual
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 from velfield.errors import count_text, list_text
 
@@ -30,6 +31,9 @@ State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
 _AT_JUNCTION_M, _ON_LANE_M, _ROAD_M = 20.0, 10.0, 50.0
+_NAMED = 3
+COVERED = "on ways that three vehicles or more drive"
+"""Where conflicts are looked for."""
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
 
@@ -84,7 +88,7 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
     places = _places([_near(analysis, r.xy_m) for r in analysis.reversals])
     yield _events("u-turns", analysis, len(analysis.reversals), places)
     yield _conflicts(analysis)
-    yield _unusual(analysis)
+    yield from _unusual(analysis)
 
 
 def seen_text(tracks: Trajectories) -> str:
@@ -105,7 +109,7 @@ def too_short(analysis: TrafficAnalysis) -> str:
 def explain_none(topic: str, analysis: TrafficAnalysis) -> str:
     """Why a table is empty: how rare the events of ``topic`` are at most, too little data, or none found."""
     seconds, tracks = analysis.trajectories.duration_s, len(analysis.trajectories)
-    if topic in ("u_turns", "conflicts", "unusual"):
+    if topic in ("u_turns", "conflicts"):
         return f"{_events(topic.replace('_', '-'), analysis, 0).text.capitalize()}."
     if seconds < _SHORT_S or tracks < _FEW_TRACKS:
         return f"Too little data: {seen_text(analysis.trajectories)}."
@@ -293,7 +297,10 @@ def _places(found: Sequence[str]) -> str:
 
 def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
     """The place of an event: the junction near it, if one is; else the lane."""
-    away = [(float(np.hypot(*(j.hull_m - xy_m).T).min()), j.number) for j in analysis.lanes.junctions]
+    away = [
+        (0.0 if inside_hull(xy_m[None], j.hull_m)[0] else float(np.hypot(*(j.hull_m - xy_m).T).min()), j.number)
+        for j in analysis.lanes.junctions
+    ]
     distance_m, number = min(away, default=(np.inf, 0))
     if distance_m < _AT_JUNCTION_M:
         return f"at {_place(analysis, number)}"
@@ -306,13 +313,23 @@ def _near(analysis: TrafficAnalysis, xy_m: FloatArray) -> str:
     return f"on lane {lane}, on the road {of[0]}" if of else f"on lane {lane}, away from junctions"
 
 
-def _unusual(analysis: TrafficAnalysis) -> Answer:
-    tracks = analysis.trajectories
-    first = "; ".join(
-        f"{u.kind} at {u.time_s:.1f} s (frame {u.frame}, track {tracks.id_of(u.track)}): {u.detail}"
-        for u in analysis.unusual[:3]
-    )
-    return _events("unusual", analysis, len(analysis.unusual), first)
+def _unusual(analysis: TrafficAnalysis) -> Iterator[Answer]:
+    """Vehicles against the traffic, which are a danger; and turns that hardly anyone takes, which need be none."""
+    wrong = [u for u in analysis.unusual if u.kind == "wrong way"]
+    seen = "; ".join(f"{u.detail} {_when(analysis, u)}" for u in wrong[:_NAMED])
+    yield _events("wrong way", analysis, len(wrong), seen)
+    turns: dict[str, list[str]] = {}
+    for u in analysis.unusual:
+        if u.kind == "rare turn":
+            turns.setdefault(u.detail, []).append(_when(analysis, u))
+    for detail, when in turns.items():
+        yield Answer("rare turn", "", "found", f"{detail} vehicles, {list_text(when)}")
+
+
+def _when(analysis: TrafficAnalysis, found: Unusual) -> str:
+    """When an unusual track is to be seen, and its id."""
+    track = analysis.trajectories.id_of(found.track)
+    return f"at {found.time_s:.1f} s (frame {found.frame}, track {track})"
 
 
 def _events(topic: str, analysis: TrafficAnalysis, n: int, detail: str = "") -> Answer:
@@ -332,7 +349,8 @@ def _events(topic: str, analysis: TrafficAnalysis, n: int, detail: str = "") -> 
         text = f"none was seen in {duration_text(seconds)}, too short a time to say how rare they are"
         return Answer(topic, "", "too little data", text)
     hourly = estimate_event_rate(0, hours).high
-    text = f"none in {duration_text(seconds)}, so fewer than {rate_text(hourly)} an hour with 90 % probability"
+    where = f" {COVERED}" if topic == "conflicts" else ""
+    text = f"none in {duration_text(seconds)}{where}, so fewer than {rate_text(hourly)} an hour with 90 % probability"
     return Answer(topic, "", "none", text, at_most_per_h=hourly)
 
 

@@ -28,7 +28,7 @@ from velfield.analysis.movements.car_parks import CarPark, find_car_parks
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.gates import ArmNames
 from velfield.analysis.movements.movements import JunctionMovements, find_movements
-from velfield.analysis.movements.reversals import Reversal, find_reversals, seen_whole_s
+from velfield.analysis.movements.reversals import Reversal, find_circle_reversals, find_reversals, seen_whole_s
 from velfield.analysis.movements.scene import OriginDestination, find_origins_destinations
 from velfield.analysis.movements.time_slices import (
     SLICE_S,
@@ -82,7 +82,7 @@ class TrafficAnalysis:
             shared[0].samples(0)
         groups = (
             ("movements", "reductions", "unusual", "scene"), ("conflicts",), ("free_flow",), ("streams", "signals"),
-            ("flows",), ("reversals", "doubtful_places"), ("car_parks",),
+            ("flows",), ("_road_reversals", "doubtful_places"), ("car_parks",),
         )  # fmt: skip
         with ThreadPoolExecutor(_THREADS) as pool:
             list(pool.map(lambda names: [getattr(self, name) for name in names], groups))
@@ -147,7 +147,12 @@ class TrafficAnalysis:
 
     @cached_property
     def reversals(self) -> list[Reversal]:
-        """U-turns."""
+        """U-turns, by time."""
+        at_circles = find_circle_reversals(self.movements, self.cut_tracks)
+        return sorted([*self._road_reversals, *at_circles], key=lambda turn: turn.time_s)
+
+    @cached_property
+    def _road_reversals(self) -> list[Reversal]:
         return find_reversals(self.samples, self.lanes, position_sd_m=self.trajectories.position_sd_m)
 
     @cached_property

@@ -1,4 +1,5 @@
-"""U-turns: tracks that reverse their direction within a short path, on a road where others go on."""
+"""U-turns: tracks that reverse their direction within a short path, on a road where others go on, or that leave a
+roundabout by the arm by which they came."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +9,8 @@ import numpy as np
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.cut_tracks import CutTracks
+from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.trajectories import PathSamples
 
 _PATH_M = 36
@@ -39,17 +42,18 @@ _LEAST_SEEN = 0.5
 @dataclass(frozen=True)
 class Reversal:
     """A U-turn: number of the track, middle of the turn and its time; ``left`` or to the right; ``takes_s``: time from
-    the way before it to the way after it, which both must be seen."""
+    the way before it to the way after it, which both must be seen; ``round_circle``: at a roundabout."""
 
     track: int
     time_s: float
     xy_m: FloatArray
     left: bool
     takes_s: float
+    round_circle: bool = False
 
 
 def find_reversals(samples: PathSamples, graph: LaneGraph, *, position_sd_m: float = 0.0) -> list[Reversal]:
-    """U-turns, by time; those within roundabouts are none, nor what errors of positions may be."""
+    """U-turns on roads, by time; those within roundabouts are none, nor what errors of positions may be."""
     n = len(samples)
     if n <= _PATH_M:
         return []
@@ -75,6 +79,32 @@ def find_reversals(samples: PathSamples, graph: LaneGraph, *, position_sd_m: flo
             left = bool(turn[best] < 0)
             out.append(Reversal(track, float(samples.time_s[middle]), samples.xy_m[middle], left, takes_s))
     return sorted(out, key=lambda row: row.time_s)
+
+
+def find_circle_reversals(movements: Sequence[JunctionMovements], cut: CutTracks) -> list[Reversal]:
+    """Vehicles that go round a roundabout and leave it by the arm by which they came."""
+    out = []
+    for found in movements:
+        if found.junction.kind != "roundabout":
+            continue
+        passes, vehicles = found.passes, cut.trajectories
+        arm = np.array([gate.arm for gate in found.gates.gates] + [-1], np.int64)
+        arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
+        for k in np.flatnonzero((arm_in >= 0) & (arm_in == arm_out)):
+            vehicle, begin_s, end_s = cut.vehicle[passes.track[k]], passes.entry_s[k], passes.exit_s[k]
+            rows = np.arange(vehicles.first[vehicle], vehicles.first[vehicle + 1])
+            rows = rows[(vehicles.time_s[rows] >= begin_s) & (vehicles.time_s[rows] <= end_s)]
+            away = vehicles.xy_m[rows] - found.junction.centre_m
+            swept = float(np.angle(np.exp(1j * np.diff(np.arctan2(away[:, 1], away[:, 0])))).sum())
+            if abs(swept) > np.pi:  # else it passes an edge of the area
+                middle = rows[len(rows) // 2]
+                out.append(
+                    Reversal(
+                        int(passes.track[k]), float(vehicles.time_s[middle]), vehicles.xy_m[middle], swept < 0,
+                        float(end_s - begin_s), round_circle=True,
+                    )
+                )  # fmt: skip
+    return out
 
 
 def seen_whole_s(reversals: Sequence[Reversal], observed_s: FloatArray) -> float:

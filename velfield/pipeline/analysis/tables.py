@@ -171,7 +171,8 @@ def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("time", "Time", "s", lambda found: found.time_s, 1),
         Column("side", "To the", "", lambda found: "left" if found.left else "right"),
     ]
-    note, rows = "Reversals within 36 m, outside circles and car parks.", analysis.reversals
+    note = "Reversals within 36 m, outside car parks, and vehicles that leave a roundabout by the arm they came by."
+    rows = analysis.reversals
     return make_table(analysis, "u_turns", "Movements", "U-turns", note, columns, rows, lambda found: found.xy_m)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import Answer, duration_text, find_answers, rate_text, seen_text
+from velfield.analysis.answers import COVERED, Answer, duration_text, find_answers, rate_text, seen_text
 from velfield.analysis.approaches import (
     ApproachDelay,
     approach_delays,
@@ -25,7 +25,7 @@ _SAFE_PER_H = 3.0
 _EVENTS = {
     "conflicts": "near misses",
     "u-turns": "U-turns",
-    "unusual": "against the traffic, or by a way that others avoid",
+    "wrong way": "against the traffic",
 }
 
 
@@ -83,6 +83,7 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
                 *(_entered(analysis, found_at) for found_at in _met(analysis)[:_PER_QUESTION] if found_at.movements),
                 *_few(found.get("movement") or found.get("through", [])),
                 *found.get("merging", []),
+                *(f"rare: {line}" for line in _few(found.get("rare turn", []))),
                 *(_few(found.get("other lanes", [])) if "movement" in found or "through" not in found else []),
             ],
             "no turn was seen three times",
@@ -172,13 +173,13 @@ def _danger(answers: list[Answer], duration_s: float) -> Iterator[str]:
     """The verdict where neither a near miss nor an unusual track was seen; else, and of U-turns, what was."""
     events = {answer.topic: answer for answer in answers if answer.topic in _EVENTS}
     seen = {topic: answer for topic, answer in events.items() if answer.state != "too little data"}
-    if all(topic in seen and seen[topic].at_most_per_h for topic in ("conflicts", "unusual")):
+    if all(topic in seen and seen[topic].at_most_per_h for topic in ("conflicts", "wrong way")):
         most = seen.pop("conflicts").at_most_per_h or 0.0
-        del seen["unusual"]
+        del seen["wrong way"]
         short = f". That is too short to call the place safe: even {rate_text(most)} near misses an hour may not show"
         yield (
             f"nothing dangerous was seen in {duration_text(duration_s)}: no two vehicles came within 1.5 s of meeting "
-            f"each other, and none drove against the traffic{short if most > _SAFE_PER_H else ''}"
+            f"each other {COVERED}, and none drove against the traffic{short if most > _SAFE_PER_H else ''}"
         )
     elif "conflicts" in events and seen and "conflicts" not in seen:
         yield f"near misses: {events['conflicts'].text}"
