@@ -30,9 +30,8 @@ def rows(seed: int) -> list[tuple[Noise, list[float]]]:
     out = []
     for noise in NOISES:
         analysis = analyse(tracks, noise, seed=seed)
-        found = true_numbers(analysis, tracks)[
-            [turn.track for turn in analysis.reversals if not turn.round_circle]
-        ].tolist()
+        turned = [turn.track for turn in analysis.reversals if not turn.round_circle]
+        found = true_numbers(analysis, tracks)[turned].tolist()
         turns = [len(whole), len(whole & set(found)), sum(k not in begun for k in found)]
         out.append((noise, [*_lanes(analysis), *turns, *_signals(analysis, traffic.cycle_s)]))
     return out
