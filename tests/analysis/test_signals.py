@@ -5,7 +5,7 @@ import pytest
 
 from tests.analysis.test_traffic_analysis import CYCLE_S, EAST, SOUTH, Track, crossroads, drive, gather
 from velfield.analysis.signals.cycles import JunctionSignal
-from velfield.analysis.signals.phases import START_DELAY_S
+from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 
 STOP_M, GAP_M = 128.0, 138.0
@@ -47,3 +47,30 @@ def test_where_the_first_is_not_seen_the_second_does_not_stand_at_the_line() -> 
     assert len(lines[0]) == len(lines[1]) == 2
     for (_, a), (_, b) in zip(*(sorted(one.items()) for one in lines), strict=True):
         assert a == pytest.approx(b, abs=1.5)
+
+
+def test_who_stands_over_the_stop_line_behind_one_that_waits_has_crossed_it() -> None:
+    """The third from the west stands with its front 3 m beyond the line until 17.8 s of the cycle; a queue's third
+    crosses within 9 s."""
+    tracks = giving_way()
+    west = next(s.stream for s in signal_of(tracks).streams if np.ptp(s.stream.approach.path_m[:, 1]) < 2.0)
+    third = np.flatnonzero(np.isin(west.cross_track, np.arange(len(tracks))[4::8]))
+    assert len(third) == 12
+    assert np.max(west.cross_time_s[third] % CYCLE_S) < 12.0
+
+
+def test_a_cycle_of_starts_that_wait_for_the_junction_to_clear_holds_the_truth() -> None:
+    """All lanes of a phase wait as long; the starts of four cycles then seem to recur after more or less than 80 s."""
+    rng, held, green, half_s = np.random.default_rng(6), [], [], []
+    for _ in range(150):
+        starts = []
+        for onset in (12.0, 52.0):
+            late = onset + START_DELAY_S + 80.0 * np.arange(4) + rng.exponential(2.5, 4)
+            starts += [late + rng.normal(0, 0.25, 4) for _ in range(4)]
+        cycle, phases = fit_phases(starts, 80.1)
+        held.append(cycle.low <= 80.0 <= cycle.high)
+        half_s.append((cycle.high - cycle.low) / 2)
+        green += [p.green_s.low < true < p.green_s.high for p, true in zip(phases, (12.0, 52.0), strict=True)]
+    assert np.mean(held) > 0.86
+    assert np.mean(green) > 0.86
+    assert np.median(half_s) < 1.6

@@ -323,10 +323,11 @@ def _red_onset(cross_time_s: FloatArray, green_s: float, cycle: Estimate) -> Est
     early, middle, late = (_last_crossing_gap(p, rate) for p in ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
     value = quiet_s + last + middle
     # the onset is that of second 0, the crossings are of some cycles later
-    drift = float(np.abs(cross_time_s).mean()) / cycle_s * (cycle.high - cycle.low) / 2
-    systematic = float(np.hypot(special.ndtri((1 + LEVEL) / 2) * _RED_SD_S, drift))
-    low = value - float(np.hypot(middle - early, systematic))
-    high = value + float(np.hypot(late - middle, systematic))
+    cycles = float(cross_time_s.mean()) / cycle_s
+    drift = sorted(cycles * (cycle.value - end) for end in (cycle.low, cycle.high))
+    systematic = float(special.ndtri((1 + LEVEL) / 2)) * _RED_SD_S
+    low = value - float(np.linalg.norm([middle - early, systematic, drift[0]]))
+    high = value + float(np.linalg.norm([late - middle, systematic, drift[1]]))
     shift = green_s - cycle_s * np.floor((value + green_s) / cycle_s)
     return Estimate(value + shift, low + shift, high + shift, n)
 

@@ -22,6 +22,8 @@ _LINE_M = 3.0
 """The first of a queue stops so near to its line at most."""
 _AHEAD_M, _AHEAD_S = 20.0, 5.0
 """A vehicle that stood so far ahead at most, so long before another set off at most, was in its way."""
+_OVER_M = 1.0
+"""A vehicle behind others that stands with its front so far beyond the line has crossed it."""
 _UPSTREAM_M, _RECUR_SHARE = 4.0, 0.25
 """Another line lies so far before the foremost at least, and so many stop there, to the place where most do."""
 _CROSSES_S = 8.0
@@ -221,6 +223,8 @@ def observe_stream(
         time, track, speed = _crossings(approach.path_m, at, samples)
         rows = here[known]
         time = _after_stops(time, track, at, stops.track[rows], stops.start_s[rows], stops.end_s[rows], along[rows])
+        over = here[known & ~first & (front > at + _OVER_M)]
+        time = _before_stops(time, track, stops.track[over], stops.start_s[over], stops.end_s[over])
         order = np.argsort(time, kind="stable")
         cross = time[order], track[order], speed[order]
         heads = here[first & (np.abs(front - (np.inf if line is None else line)) < _LINE_M)]
@@ -277,6 +281,18 @@ def _after_stops(
     stands = (stop_track[row] == track) & (start_s[row] <= time_s) & (time_s < end_s[row])
     reaches = end_s[row] + np.sqrt(2 * np.maximum(at_m - along_m[row], 0.0) / _SETS_OFF_M_PER_S2)
     return np.asarray(np.where(stands, reaches, time_s))
+
+
+def _before_stops(
+    time_s: FloatArray, track: IntArray, stop_track: IntArray, start_s: FloatArray, end_s: FloatArray
+) -> FloatArray:
+    """Times (n,) of crossings by the middle of a vehicle: as its stop (m,) begins, if it stands over the line."""
+    begin = {int(k): (float(a), float(b)) for k, a, b in zip(stop_track, start_s, end_s, strict=True)}
+    out = time_s.copy()
+    for row in np.flatnonzero(np.isin(track, stop_track)):
+        start, end = begin[int(track[row])]
+        out[row] = start if start <= time_s[row] < end + _CROSSES_S else time_s[row]
+    return out
 
 
 def _goes_on(track: IntArray, end_s: FloatArray, crossed: IntArray, cross_s: FloatArray) -> Mask:
