@@ -85,7 +85,8 @@ class GridRecord(Model):
     width_px: PositiveInt
     height_px: PositiveInt
     origin_x_px: float = 0.0
-    """Column of the reference frame's undistorted grid that base pixel (0, 0) has; 0 where a base image was given."""
+    """Column that base pixel (0, 0) has on the reference frame's undistorted grid, or of tracks in metres on the grid
+    whose pixel (0, 0) is at x = y = 0; 0 where a base image was given."""
     origin_y_px: float = 0.0
     gsd_m: PositiveFloat | None = None
     """Metres a base pixel; none: not known, all stays in px/s."""
@@ -94,8 +95,9 @@ class GridRecord(Model):
     """Base pixel (column, row) -> CRS coordinates, GDAL's corner convention, as rasterio's ``Affine``."""
     north_rad: float | None = None
     """Direction of true north, from +x towards +y (down), where it is known without a reference system."""
-    base_source: Literal["flight", "given"]
-    """``flight``: the base image is built from the flight; ``given``: it is the image given as ``--base``."""
+    base_source: Literal["flight", "given", "tracks"]
+    """``flight``: the base image is built from the flight; ``given``: it is the image given as ``--base``; ``tracks``:
+    it is drawn from tracks in metres."""
     registered_to: Literal["flight", "given"] = "flight"
     """Image that frames are registered to: the base image built from the flight, or directly the given one."""
     reference_frame: NonNegativeInt

@@ -22,6 +22,7 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.exports.export import export_run
 from velfield.pipeline.analysis.analyse import analyse_tracks
+from velfield.pipeline.compare import compare_runs
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.pipeline.given_tracks.plan import plan_tracks
 from velfield.pipeline.given_tracks.write import at_frames
@@ -108,7 +109,7 @@ def test_the_field_has_the_true_speeds(run: Run) -> None:
     same = t["vehicle_id"].diff(-1) == 0
     v = -t[["x_m", "y_m"]].diff(-1)[same].to_numpy() / -t["time_s"].diff(-1)[same].to_numpy()[:, None]
     at = t[["x_m", "y_m"]][same].to_numpy()
-    corner = t[["x_m", "y_m"]].to_numpy().min(axis=0) - 10.0
+    corner = np.array([run.grid.origin_x_px, run.grid.origin_y_px]) * GSD_M
     modal = run.field.modal_velocity() * GSD_M
     xy = np.round((at - corner) / GSD_M).astype(int)
     found = modal[xy[:, 1], xy[:, 0]]
@@ -153,11 +154,40 @@ def street(ids: list[str | int]) -> pd.DataFrame:
     return pd.concat(rows[::-1])
 
 
+def test_runs_of_one_place_in_metres_are_compared_where_both_reach(tmp_path: Path) -> None:
+    """The second file is of the same street, on which vehicles drive at 6 m/s in place of 10, and reaches farther."""
+    first, more = street([*range(20)]), street([*range(20)])
+    more["time_s"] /= 0.6
+    more.loc[more["id"] == 19, "x_m"] *= 1.5
+    runs = []
+    for k, table in enumerate((first.assign(x_m=first["x_m"] + 7.0), more.assign(x_m=more["x_m"] + 7.0))):
+        table.to_csv(tmp_path / f"{k}.csv", index=False)
+        runs.append(process(tmp_path / f"{k}.csv", tmp_path / f"run{k}", position_y_axis="down"))
+    assert runs[0].grid.width_px < runs[1].grid.width_px
+    for before, after in (runs, runs[::-1]):
+        roots = before.layout.root, after.layout.root
+        lines = compare_runs(*roots, tmp_path / "out")
+        speed = next(line for line in lines if line.startswith("speed"))
+        by = float(re.search(r"by ([+-][\d.]+) km/h", speed)[1])
+        assert by == pytest.approx(-14.4 if after is runs[1] else 14.4, abs=0.5)
+        table = pd.read_csv(tmp_path / "out" / "traffic_change.csv")
+        assert table["what"].str.startswith("free-flow speed at").any()
+
+
+def test_runs_of_two_places_in_metres_are_not_compared(tmp_path: Path) -> None:
+    roots = []
+    for k in range(2):
+        street([1, 2, 3]).assign(x_m=lambda t, k=k: t["x_m"] + 900.0 * k).to_csv(tmp_path / "t.csv", index=False)
+        roots.append(process(tmp_path / "t.csv", tmp_path / str(k), position_y_axis="down").layout.root)
+    with pytest.raises(InputError, match="have no place in common"):
+        compare_runs(*roots, tmp_path / "out")
+
+
 @pytest.mark.parametrize("ids", [[*range(99, 60, -3), 64], [*(f"car.{k}" for k in range(13)), "bus & tram"]])
 def test_a_track_has_the_id_of_the_users_file_wherever_it_is_shown(ids: list[str | int], tmp_path: Path) -> None:
     street(ids).to_csv(tmp_path / "t.csv", index=False)
     lines = [*analyse_tracks(tmp_path / "t.csv", tmp_path / "out", gsd_m=None, fps=None, unit=None, y_axis="down")]
-    assert any(re.search(rf"wrong way at .* track {ids[-1]}\)", line) for line in lines)
+    assert any(re.match(rf"wrong way .* track {ids[-1]}\)", line) for line in lines)
     record = AnalysisRecord.model_validate_json((tmp_path / "out" / "analysis.json").read_text())
     unusual = next(table for table in record.tables if table.name == "unusual")
     assert [row.cells["track"] for row in unusual.rows] == [ids[-1]]

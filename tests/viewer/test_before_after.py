@@ -54,3 +54,12 @@ def test_two_flights_of_the_same_traffic_differ_in_nothing(before: TrafficAnalys
     page = before_after_html(before, before, find_changes(before, before))
     assert listed(page) == []
     assert "Nothing that was compared differs by more than chance" in page
+
+
+def test_where_nothing_is_known_of_both_it_says_that_nothing_was_compared(before: TrafficAnalysis) -> None:
+    short = TrafficAnalysis(gather([drive(EAST, 3.0 * k) for k in range(4)]))
+    page = before_after_html(before, short, find_changes(before, short), pixels=["speed      no significant change"])
+    assert listed(page) == ["speed      no significant change"]
+    assert "could be compared: none is known at the same place in both" in page
+    assert "by more than chance" not in page
+    assert "0 of 0" not in page

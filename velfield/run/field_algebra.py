@@ -4,6 +4,9 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+from rasterio.transform import Affine
+
 from velfield.errors import InputError
 from velfield.field.accumulate import FieldTile
 from velfield.field.algebra import merge_tiles, subtract_tile
@@ -20,6 +23,8 @@ from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, store_key
 Combine = Callable[[Sequence[FieldTile | None]], FieldTile | None]
 
 _SAME = ("bin_width_px_per_s", "kernel_sigma_px_per_s", "band_radius_px", "velocity_span_s", "weighted_by", "gsd_m")
+_WHOLE_PX = 0.01
+"""Grids that lie farther than this from whole pixels of each other have none in common."""
 _SAME_GEOREFERENCE = ("crs_wkt", "geotransform")
 
 
@@ -77,14 +82,57 @@ def check_same_grid(first: Path, other: Path) -> None:
     a, b = (FieldStore(RunLayout(root).field) for root in (first, other))
     if a.shape != b.shape or a.tile != b.tile:
         raise InputError(_mismatch(first, other, "size", f"{a.shape[::-1]} px", f"{b.shape[::-1]} px"))
-    for name in (*_SAME, *_SAME_GEOREFERENCE):
-        if a.attributes.get(name) != b.attributes.get(name):
-            raise InputError(_mismatch(first, other, name, a.attributes.get(name), b.attributes.get(name)))
-    if not a.attributes.get("crs_wkt") and _base_digest(first) != _base_digest(other):
+    _check_same(first, other, (*_SAME, *_SAME_GEOREFERENCE))
+    known = a.attributes.get("crs_wkt") or find_offset(first, other) == (0, 0)
+    if not known and _base_digest(first) != _base_digest(other):
         raise InputError(
             f"{first} and {other} have different base images, and no coordinates to relate their pixels: "
             "run both with the same --base"
         )
+
+
+def common_offset(first: Path, other: Path) -> tuple[int, int]:
+    """Column and row of the other field's grid at which pixel (0, 0) of the first one lies: (0, 0) on one grid.
+
+    Raises
+    ------
+    InputError
+        They have no pixels in common, other velocity bins, or nothing that relates their pixels.
+    """
+    offset = find_offset(first, other)
+    if offset is None:
+        check_same_grid(first, other)
+        return 0, 0
+    _check_same(first, other, (*_SAME, "crs_wkt"))
+    a, b = (np.array(FieldStore(RunLayout(root).field).shape[::-1]) for root in (first, other))
+    if (np.minimum(a + offset, b) <= np.maximum(offset, 0)).any():
+        raise InputError(f"{first} and {other} have no place in common; give two runs of one place")
+    return offset
+
+
+def find_offset(first: Path, other: Path) -> tuple[int, int] | None:
+    """As `common_offset`; None where neither coordinates nor metres of tracks relate the pixels, or not by whole
+    pixels."""
+    a, b = (read_grid(RunLayout(root)) for root in (first, other))
+    if a.gsd_m != b.gsd_m:
+        return None
+    if a.affine and b.affine and a.crs_wkt == b.crs_wkt:
+        first_map, other_map = Affine(*a.affine), Affine(*b.affine)
+        if not np.allclose(first_map[:2] + first_map[3:5], other_map[:2] + other_map[3:5], rtol=1e-9, atol=0):
+            return None
+        at = np.array(~other_map * (first_map.c, first_map.f))
+    elif a.base_source == b.base_source == "tracks" and not (a.crs_wkt or b.crs_wkt):
+        at = np.array([a.origin_x_px - b.origin_x_px, a.origin_y_px - b.origin_y_px])
+    else:
+        return None
+    return (round(at[0]), round(at[1])) if np.abs(at - at.round()).max() < _WHOLE_PX else None
+
+
+def _check_same(first: Path, other: Path, names: Sequence[str]) -> None:
+    a, b = (FieldStore(RunLayout(root).field).attributes for root in (first, other))
+    for name in names:
+        if a.get(name) != b.get(name):
+            raise InputError(_mismatch(first, other, name, a.get(name), b.get(name)))
 
 
 def _mismatch(first: Path, other: Path, what: str, a: object, b: object) -> str:

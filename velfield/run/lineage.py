@@ -143,7 +143,11 @@ def describe_base_image(run: Run) -> str:
     grid = run.grid
     name = (run.layout.base_image_tif if run.layout.base_image_tif.exists() else run.layout.base_image).name
     digest = _output(run, "base", f"base/{name}")
-    source = f"given, digest {run.record.inputs.base}" if grid.base_source == "given" else "built from the flight"
+    source = {
+        "flight": "built from the flight",
+        "given": f"given, digest {run.record.inputs.base}",
+        "tracks": "drawn from the tracks",
+    }[grid.base_source]
     line = f"base/{name}, digest {digest}, {grid.width_px} x {grid.height_px} px, {source}"
     if grid.intersensor_error_px is not None:
         line += f"; registered to {grid.intersensor_error_px:.2f} px"

@@ -20,7 +20,10 @@ from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
 GSD_M = 0.2
 """Base pixels of tracks given in metres, where --gsd-m does not say."""
 MARGIN_M = 10.0
-"""Around the positions, where no base image is given."""
+"""Least margin around the positions, where no base image is given."""
+LATTICE_PX = 50
+"""Maps of tracks in metres begin and end at multiples of so many pixels from x = y = 0: two files of one place lie on
+one grid."""
 _STEP_S = 0.2
 _CHECKED_TRACKS = 500
 SIZE_SD_M = 0.1
@@ -41,6 +44,8 @@ class LoadedTracks:
     shape: tuple[int, int]
     gsd_m: float
     """(height, width) of the grid, px, and metres a pixel."""
+    origin_px: tuple[float, float] | None
+    """Pixels from x = y = 0 of the file to base pixel (0, 0), to the right and down; None of positions in pixels."""
     base: BaseRaster | None
     """The base image that was given."""
     crs_wkt: str | None
@@ -93,9 +98,11 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     if given.unit == "m" and raster is not None:
         raise InputError(f"{path}: found metres and --base, expected positions in the pixels of that image")
     gsd_m = _gsd_m(path, given, config.gsd_m, raster)
-    corner = np.zeros(2)
+    corner = origin_px = np.zeros(2)
     if given.unit == "m":
-        corner = given.table[["x", "y"]].to_numpy(np.float64).min(axis=0) - MARGIN_M
+        lowest = given.table[["x", "y"]].to_numpy(np.float64).min(axis=0) - MARGIN_M
+        origin_px = np.floor(lowest / (gsd_m * LATTICE_PX)) * LATTICE_PX
+        corner = origin_px * gsd_m
     to_px = 1 / gsd_m if given.unit == "m" else 1.0
     table = given.table.rename(columns={"x": "x_px", "y": "y_px"})
     table[["x_px", "y_px"]] = (table[["x_px", "y_px"]] - corner) * to_px
@@ -125,7 +132,8 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     if crs_wkt is not None and affine is not None:
         north_rad = true_north_rad(crs_wkt, affine, shape, name=path.name)
     table = table.drop(columns="source_id")
-    return LoadedTracks(table, names, shape, gsd_m, raster, crs_wkt, affine, north_rad, *errors, tuple(notes))
+    origin = None if given.unit != "m" else (float(origin_px[0]), float(origin_px[1]))
+    return LoadedTracks(table, names, shape, gsd_m, origin, raster, crs_wkt, affine, north_rad, *errors, tuple(notes))
 
 
 def _names(table: pd.DataFrame) -> pd.Series:
@@ -173,6 +181,8 @@ def _shape(path: Path, unit: str, table: pd.DataFrame, gsd_m: float) -> tuple[in
     low, far = xy.min(axis=0), xy.max(axis=0) + MARGIN_M / gsd_m * (unit == "m")
     if (low < 0).any():
         raise InputError(f"{path}: found pixels down to {low.min():.0f}, expected none below 0; give them from 0 on")
+    if unit == "m":
+        far = np.ceil(far / LATTICE_PX) * LATTICE_PX - 1
     return int(np.ceil(far[1])) + 1, int(np.ceil(far[0])) + 1
 
 

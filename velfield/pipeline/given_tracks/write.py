@@ -164,7 +164,9 @@ def _write_base(layout: RunLayout, given: LoadedTracks, positions: pd.DataFrame)
         crs_wkt=given.crs_wkt,
         affine=given.affine,
         north_rad=None if given.crs_wkt else given.north_rad,
-        base_source="given",
+        origin_x_px=given.origin_px[0] if given.origin_px else 0.0,
+        origin_y_px=given.origin_px[1] if given.origin_px else 0.0,
+        base_source="tracks" if given.origin_px else "given",
         registered_to="given",
         reference_frame=0,
     )

@@ -15,11 +15,20 @@ from velfield.report.traffic.turning import draw_turning
 
 _UNITS = {"m/s": (3.6, "km/h"), "": (100.0, "%")}
 """Displayed unit and factor, by unit; shares in per cent."""
+NOTHING_COMPARED = (
+    "no share, flow, delay, cycle or free-flow speed could be compared: none is known at the same place in both, as of "
+    "clips that are too short"
+)
 _WIDTH_IN, _HEIGHT_IN = 11.0, 4.4
 
 
 def before_after_html(
-    before: TrafficAnalysis, after: TrafficAnalysis, changes: Sequence[Change], *, maps: Sequence[tuple[str, str]] = ()
+    before: TrafficAnalysis,
+    after: TrafficAnalysis,
+    changes: Sequence[Change],
+    *,
+    pixels: Sequence[str] = (),
+    maps: Sequence[tuple[str, str]] = (),
 ) -> str:
     """The page.
 
@@ -27,20 +36,26 @@ def before_after_html(
     ----------
     changes
         What `velfield.analysis.changes.find_changes` gives of both.
+    pixels
+        Lines on direction, speed and volume at the pixels of the map.
     maps
         Title and address of each map of what changed.
     """
     real = [change for change in changes if change.significant]
     found = "".join(f"<li>{escape(change_text(change))}</li>" for change in real)
-    verdict = (
-        f"<ul>{found}</ul>"
-        if real
-        else "<p>Nothing that was compared differs by more than chance: film longer to see smaller changes.</p>"
-    )
+    verdict = f"<p>{len(real)} of {len(changes)} comparisons of junctions and roads.</p>"
+    if not changes:
+        verdict = f"<p>{NOTHING_COMPARED}.</p>"
+    elif real:
+        verdict += f"<ul>{found}</ul>"
+    else:
+        verdict += "<p>Nothing that was compared differs by more than chance: film longer to see smaller changes.</p>"
     pictures = "".join(
         _turns(old, new) for old, new in common_junctions(before, after) if old.movements and new.movements
     )
-    figures = "".join(
+    at_pixels = "".join(f"<li>{escape(line)}</li>" for line in pixels)
+    figures = f"<h2>On the map</h2><ul class='pixels'>{at_pixels}</ul>" if pixels else ""
+    figures += "".join(
         f'<figure><h2>{escape(title)}</h2><img src="{escape(url)}" alt="{escape(title)}"></figure>'
         for title, url in maps
     )
@@ -50,14 +65,15 @@ def before_after_html(
         for c in changes
     )
     heads = "".join(f"<th>{head}</th>" for head in ("Quantity", "Before", "After", "p", "More than chance"))
+    table = f"<div class='scroll'><table><tr>{heads}</tr>{rows}</table></div>"
+    compared = f"<h2>All that was compared</h2>{table}" if changes else ""
     seen = [seen_text(analysis.trajectories) for analysis in (before, after)]
     return page_html(
         "Before and after",
         f"Before: {seen[0]}. After: {seen[1]}.",
-        f"<h2>What changed</h2><p>{len(real)} of {len(changes)} comparisons of junctions and roads.</p>{verdict}"
+        f"<h2>What changed</h2>{verdict}"
         "<p class='note'>In brackets: the 90 % interval, and n. Of the changes that are listed some "
-        f"{FDR_LEVEL:.0%} are chance (false discovery rate).</p>{pictures}{figures}"
-        f"<h2>All that was compared</h2><div class='scroll'><table><tr>{heads}</tr>{rows}</table></div>",
+        f"{FDR_LEVEL:.0%} are chance (false discovery rate).</p>{pictures}{figures}{compared}",
     )
 
 
