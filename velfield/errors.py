@@ -113,12 +113,12 @@ class Failure:
         return False
 
 
-def list_text(names: Sequence[str]) -> str:
-    """Names for people.
+def list_text(names: Sequence[str], word: str = "and") -> str:
+    """Names for people, with a word before the last.
 
     Examples
     --------
-    >>> list_text(["N", "S", "W"])
-    'N, S and W'
+    >>> list_text(["N", "S", "W"]), list_text(["N", "S"], "or")
+    ('N, S and W', 'N or S')
     """
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

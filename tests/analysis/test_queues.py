@@ -5,18 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.analysis.test_traffic_analysis import CYCLE_S, crossroads, gather
+from tests.analysis.test_traffic_analysis import CYCLE_S, SOUTH, Track, crossroads, drive, gather
 from velfield.analysis.answers import find_answers
+from velfield.analysis.changes import find_changes
 from velfield.analysis.signals.cycles import StreamSignal, least_green_s, queues
 from velfield.analysis.signals.queues import Stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
+from velfield.report.traffic.first_page import first_page
 
 
 def signals_from_the_north(analysis: TrafficAnalysis) -> list[StreamSignal]:
     """The streams down the image: four vehicles stand there at each green."""
     streams = [s for signal in analysis.signals.values() for s in signal.streams]
     return [s for s in streams if abs(np.diff(s.stream.approach.path_m[[0, -30]], axis=0)[0, 0]) < 2]
+
+
+def queue_answers(analysis: TrafficAnalysis) -> dict[str, str]:
+    return {answer.subject: answer.text for answer in find_answers(analysis) if answer.topic == "queue"}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +80,7 @@ def test_a_queue_that_ends_where_the_view_begins_is_a_lower_bound(stream: Stream
         assert (queue.vehicles.value, queue.reaches_edge, whole.reaches_edge) == (4, True, False)
     assert cut.delay_is_partial(junction, "N")
     assert not cut.delay_is_partial(junction, "W")
-    said = {answer.subject: answer.text for answer in find_answers(cut) if answer.topic == "queue"}
+    said = queue_answers(cut)
     assert "straight on to S (lane 2): at least 4 vehicles" in said[f"junction {junction} from N"]
     assert "straight on to E and right to S (lane 0): 4 vehicles" in said[f"junction {junction} from W"]
 
@@ -97,3 +103,52 @@ def test_where_some_are_hidden_others_may_be_behind_the_last() -> None:
     assert found.stream.hidden_share > 0.1
     held = [q.vehicles.low <= 4 <= q.vehicles.high for q in queues(found.stream, found.green_s[1:-1])]
     assert np.mean(held) >= 0.8
+
+
+def blocked_lane(n: int = 6) -> list[Track]:
+    """From the north, on a second lane, ``n`` vehicles stand until the seventh minute: they start once in the film."""
+    lane = SOUTH - [3.5, 0.0]
+    return [drive(lane, -4.0 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=425.0 + 1.8 * k) for k in range(n)]
+
+
+def test_the_queue_of_a_lane_of_unknown_green_is_counted() -> None:
+    analysis = TrafficAnalysis(gather(crossroads() + blocked_lane()))
+    assert len(signals_from_the_north(analysis)) == 1
+    said = queue_answers(analysis)
+    (lane,) = {k for k, queue in analysis.lane_queues[0].items() if queue and queue.vehicles.n == 6}
+    assert said["junction 0 from N"] == f"longest, straight on to S (lane {lane}): 6 vehicles, 39 m"
+    waits = dict(first_page(analysis).answers)["Which approach waits longest, and how long are the queues?"]
+    assert waits[0] == f"junction 0: the longest queue is from N, straight on to S (lane {lane}): 6 vehicles, 39 m"
+
+
+def test_no_queue_is_the_longest_where_another_is_not_known() -> None:
+    """Those that drive on are tracked under the trees over the stop line; those that stand are lost before them."""
+    lost = [(t[xy[:, 1] < 48.0], xy[xy[:, 1] < 48.0]) for t, xy in blocked_lane(8)]
+    drive_on = [drive(SOUTH - [3.5, 0.0], 440.0 + 4.0 * k) for k in range(5)]
+    analysis = TrafficAnalysis(gather(crossroads() + lost + drive_on))
+    (found,) = analysis.movements
+    lane = next(k for k, queue in analysis.lane_queues[found.junction.number].items() if queue is None)
+    assert found.gates.arms_in[lane] == "N"
+    (line,) = [a for a in find_answers(analysis) if a.topic == "queue" and a.state == "too little data"]
+    assert f"vehicles stand on lane {lane}" in line.text
+    waits = dict(first_page(analysis).answers)["Which approach waits longest, and how long are the queues?"]
+    assert waits[0].startswith("junction 0: the longest queue is from W")
+    assert waits[0].endswith("the longest from N may be as long")
+    assert any(f"longest queue at least 4 vehicles, 25 m; on lane {lane} it may have been as long" in w for w in waits)
+
+
+def test_of_a_wait_out_of_view_no_upper_bound_is_said() -> None:
+    longer = [
+        drive(SOUTH, 40.0 * n - 4 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=40.0 * n + 21.8 + 1.8 * k)
+        for n in range(12)
+        for k in (4, 5)
+    ]
+    free = [drive(SOUTH, 490.0 + 10.0 * k) for k in range(5)]
+    seen = [(t[xy[:, 1] >= 30.0], xy[xy[:, 1] >= 30.0]) for t, xy in crossroads() + longer + free]
+    cut = TrafficAnalysis(gather(seen))
+    delay = next(a for a in find_answers(cut) if a.topic == "delay" and a.subject.endswith("from N"))
+    assert delay.text.startswith("mean at least")
+    assert delay.estimate is None
+    assert not any(change.what.startswith("delay from N") for change in find_changes(cut, cut))
+    (fair,) = [line for line in dict(first_page(cut).answers)["Is there a signal, and is it fair?"] if "fair" in line]
+    assert "at most" not in fair

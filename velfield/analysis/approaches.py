@@ -1,7 +1,7 @@
 """Approaches of a junction for people: names of their lanes, delay, level of service, queues."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot, sqrt
 
 import numpy as np
@@ -32,6 +32,11 @@ class ApproachDelay:
     level: str
     limits_s: tuple[float, ...]
     partly: bool
+
+    @property
+    def estimate_s(self) -> Estimate | None:
+        """The delay with its interval; None where a part of the wait is out of view."""
+        return None if self.partly else self.delay_s
 
     @property
     def value_text(self) -> str:
@@ -66,7 +71,8 @@ def arms_without_delay(found: JunctionMovements, delays: Sequence[ApproachDelay]
 def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ()) -> str:
     """By how much the first approach, with the longest delay, waits longer than the last; or that none is shown to.
 
-    The two are chosen by their delays, so the interval is that of the range of all of them.
+    The two are chosen by their delays, so the interval is that of the range of all of them. A delay that is a lower
+    bound has no upper one, nor has its difference from another; and no other is shown to be longer than it.
 
     Parameters
     ----------
@@ -85,28 +91,45 @@ def compare_delays(delays: Sequence[ApproachDelay], unknown: Sequence[str] = ())
     'whether it is fair is not known: the delay from E and N is not'
     >>> compare_delays([west, west], ["N"])
     'whether it is fair is not known: the delay from N is not; those from W and W are within 0 s'
+    >>> compare_delays([west, ApproachDelay("S", Estimate(21, 14, 28, 60), "", (), True)])
+    'whether it is fair is not known: vehicles from S wait at least 14 s, and longer out of view'
     """
-    lacks = f"whether it is fair is not known: the delay from {list_text(unknown)} is not" if unknown else ""
-    if len(delays) < 2:
+    known, beyond = ([d for d in delays if d.partly is partly] for partly in (False, True))
+    missing = [f"the delay from {list_text(unknown)} is not"] if unknown else []
+    if len(delays) > 1:
+        missing += [f"vehicles from {d.arm} wait {d.value_text}, and longer out of view" for d in beyond]
+    lacks = f"whether it is fair is not known: {'; '.join(missing)}" if missing else ""
+    if len(delays) < 2 or not known:
         return lacks
-    longest, shortest = delays[0], delays[-1]
-    sd_s = [(d.delay_s.high - d.delay_s.low) / (2 * stats.norm.ppf(0.95)) for d in (longest, shortest)]
-    reach_s = float(stats.studentized_range.ppf(0.9, len(delays), np.inf)) * hypot(*sd_s) / sqrt(2)
-    by_s = longest.delay_s.value - shortest.delay_s.value
-    if by_s < reach_s and lacks:
-        return f"{lacks}; those from {list_text([d.arm for d in delays])} are within {by_s:.0f} s"
-    least, most = f"{by_s - reach_s:.0f}", f"{by_s + reach_s:.0f}"
-    if by_s < reach_s:
-        part = ", in view," if longest.partly or shortest.partly else ""
-        by = f"by {by_s:.0f} s, at most by {most} s with 90 % probability"
-        return f"it is not shown to be unfair: mean delays{part} differ {by}"
-    longer = f"at least {least} s" if longest.partly else f"{by_s:.0f} s ({least} to {most})"
-    return (
-        f"it is not fair by waiting time: vehicles from {longest.arm} wait {longer} longer than those from "
-        f"{shortest.arm}"
-        + (", as far as is seen" if shortest.partly else "")
-        + (f"; the delay from {list_text(unknown)} is not known" if unknown else "")
-    )
+    shortest = known[-1]
+    for longest in delays[0], known[0]:
+        by_s = longest.delay_s.value - shortest.delay_s.value
+        sd_s = [(d.delay_s.high - d.delay_s.low) / (2 * stats.norm.ppf(0.95)) for d in (longest, shortest)]
+        reach_s = float(stats.studentized_range.ppf(0.9, len(delays), np.inf)) * hypot(*sd_s) / sqrt(2)
+        if by_s >= reach_s and longest is not shortest:
+            by = f"{by_s:.0f} s ({by_s - reach_s:.0f} to {by_s + reach_s:.0f})"
+            longer = f"at least {by_s - reach_s:.0f} s" if longest.partly else by
+            more = [f"; those from {d.arm} wait {d.value_text}, and longer out of view" for d in beyond if d != longest]
+            more += [f"; the delay from {list_text(unknown)} is not known"] if unknown else []
+            who = f"vehicles from {longest.arm} wait {longer} longer than those from {shortest.arm}"
+            return f"it is not fair by waiting time: {who}{''.join(more)}"
+    if lacks and len(known) > 1:
+        return f"{lacks}; those from {list_text([d.arm for d in known])} are within {by_s:.0f} s"
+    most = f"{by_s + reach_s:.0f} s with 90 % probability"
+    return lacks or f"it is not shown to be unfair: mean delays differ by {by_s:.0f} s, at most by {most}"
+
+
+def wait_longest(delays: Sequence[ApproachDelay]) -> list[str]:
+    """Arms from which vehicles may wait longest, as far as delays are known.
+
+    Examples
+    --------
+    >>> at = lambda arm, s, partly: ApproachDelay(arm, Estimate(s, s - 5, s + 5, 40), "", (), partly)
+    >>> wait_longest([at("E", 46, False), at("S", 25, True), at("N", 22, False)])
+    ['E', 'S']
+    """
+    least_s = max(d.delay_s.low for d in delays)
+    return [d.arm for d in delays if d.partly or d.delay_s.high >= least_s]
 
 
 def lane_names(found: JunctionMovements) -> dict[int, str]:
@@ -114,18 +137,70 @@ def lane_names(found: JunctionMovements) -> dict[int, str]:
     return {lane: f"from {arm}, lane {lane}" for lane, arm in found.gates.arms_in.items()}
 
 
-def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, tuple[int, Queue]]:
-    """The longest queue at a green of each arm of a junction whose signal is known, where vehicles queue, and its
-    lane."""
-    signal, arm = analysis.signals.get(found.junction.number), found.gates.arms_in
-    out: dict[str, tuple[int, Queue]] = {}
-    for stream in signal.streams if signal else ():
-        lane = stream.stream.approach.lane
-        name = arm.get(lane)
-        for queue in stream.queues:
-            if name and queue.vehicles.value and (name not in out or queue.length_m > out[name][1].length_m):
-                out[name] = lane, queue
+@dataclass(frozen=True)
+class ArmQueue:
+    """The longest queue of an arm: ``queue``, of a ``lane``, if it was not on one of the lanes ``alike``.
+
+    ``vehicles`` with their interval; None: there is no upper bound, as a queue ends out of view or is not known.
+    """
+
+    lane: int
+    queue: Queue
+    alike: tuple[int, ...]
+    vehicles: Estimate | None
+
+    @property
+    def text(self) -> str:
+        """The queue for people: ``at least 8 vehicles, 52 m; on lane 0 it may have been as long``."""
+        queue = self.queue
+        if self.vehicles or queue.reaches_edge:
+            said = queue_text(queue)
+        else:
+            said = f"at least {count_text(queue.vehicles.low, 'vehicle')}, {queue.length_m:.0f} m"
+        return said + (f"; on {lanes_text(self.alike)} it may have been as long" if self.alike else "")
+
+
+def longest_queues(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, ArmQueue]:
+    """The longest queue of each arm of a junction whose signal is known, where vehicles queue, the longest first."""
+    by_arm: dict[str, dict[int, Queue | None]] = {}
+    for lane, queue in analysis.lane_queues.get(found.junction.number, {}).items():
+        by_arm.setdefault(found.gates.arms_in.get(lane, ""), {})[lane] = queue
+    out = {}
+    for arm, queues in by_arm.items():
+        known = {lane: queue for lane, queue in queues.items() if queue}
+        if known:
+            lane, longest = max(known.items(), key=lambda item: (item[1].length_m, -item[0]))
+            least = longest.vehicles.low
+            alike = {k: q for k, q in queues.items() if k != lane and _reach(q) >= least}
+            most = max(_reach(longest), *map(_reach, alike.values()), 0.0)
+            vehicles = replace(longest.vehicles, high=most) if most < np.inf else None
+            out[arm] = ArmQueue(lane, longest, tuple(sorted(alike)), vehicles)
+    return dict(sorted(out.items(), key=lambda item: -item[1].queue.length_m))
+
+
+def _reach(queue: Queue | None) -> float:
+    """Upper bound of the vehicles of a queue, which may not be known."""
+    return np.inf if queue is None or queue.reaches_edge else queue.vehicles.high
+
+
+def lanes_without_queue(analysis: TrafficAnalysis, found: JunctionMovements) -> dict[str, list[int]]:
+    """Lanes by arm on which vehicles stand before a junction whose signal is known, in a queue that is not."""
+    out: dict[str, list[int]] = {}
+    for lane, queue in analysis.lane_queues.get(found.junction.number, {}).items():
+        if queue is None:
+            out.setdefault(found.gates.arms_in.get(lane, ""), []).append(lane)
     return out
+
+
+def lanes_text(lanes: Sequence[int]) -> str:
+    """Lanes by their numbers.
+
+    Examples
+    --------
+    >>> lanes_text([2]), lanes_text([0, 1])
+    ('lane 2', 'lanes 0, 1')
+    """
+    return f"lane{'s' if len(lanes) != 1 else ''} {', '.join(map(str, lanes))}"
 
 
 def lane_text(found: JunctionMovements, lane: int) -> str:

@@ -96,7 +96,9 @@ def _junctions(before: TrafficAnalysis, after: TrafficAnalysis) -> Iterator[Quan
                 yield f"share {way}", "", centre, m.share, other.share
                 yield f"flow {way}", "veh/h", centre, m.flow_veh_per_h, other.flow_veh_per_h
                 yield f"travel time {way}", "s", centre, m.travel_time_s, other.travel_time_s
-                yield f"delay {way}", "s", centre, m.delay_s, other.delay_s
+                whole = not any(a.delay_is_partial(k.junction, m.arm_in) for a, k in ((before, m), (after, other)))
+                if whole:  # of lower bounds no difference is known
+                    yield f"delay {way}", "s", centre, m.delay_s, other.delay_s
 
 
 def _roads(before: TrafficAnalysis, after: TrafficAnalysis) -> Iterator[Quantity]:

@@ -1,5 +1,6 @@
 """`TrafficAnalysis`: every question about the tracks of one flight, each answer computed once."""
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -37,7 +38,8 @@ from velfield.analysis.movements.time_slices import (
     origins_by_slice,
     slice_edges,
 )
-from velfield.analysis.signals.cycles import JunctionSignal, find_signal
+from velfield.analysis.signals.cycles import JunctionSignal, Queue, find_signal
+from velfield.analysis.signals.longest_queue import longest_queues
 from velfield.analysis.signals.queues import Stops, Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
@@ -194,19 +196,20 @@ class TrafficAnalysis:
         return signal.signalised if signal else False
 
     @cached_property
-    def _queued_beyond(self) -> set[tuple[int, str]]:
-        """Junctions and arms whose queues end out of view at a green, of signals whose cycle is known."""
-        out = set()
-        for found in self.movements:
-            signal, arm = self.signals.get(found.junction.number), found.gates.arms_in
-            for one in signal.streams if signal else ():
-                if any(queue.reaches_edge for queue in one.queues):
-                    out.add((found.junction.number, arm.get(one.stream.approach.lane, "")))
-        return out
+    def lane_queues(self) -> dict[int, Mapping[int, Queue | None]]:
+        """The longest queue of each lane with vehicles that stand before a junction whose signal is known, by the
+        junction's number and the lane's; None: not known."""
+        return {
+            number: longest_queues(self.streams[number], signal.streams)
+            for number, signal in self.signals.items()
+            if signal.signalised
+        }
 
     def delay_is_partial(self, junction: int, arm: str) -> bool:
-        """Whether the vehicles that enter a junction by an arm wait out of view too."""
-        return (junction, arm) in self._queued_beyond
+        """Whether vehicles that enter a junction by an arm wait out of view, too, or in a queue that is not known."""
+        arm_of = self.movements[junction].gates.arms_in
+        queues = self.lane_queues.get(junction, {}).items()
+        return any(queue is None or queue.reaches_edge for lane, queue in queues if arm_of.get(lane) == arm)
 
     def junction_kind(self, junction: int) -> JunctionKind:
         """Kind of a junction: a crossing is an intersection where a signal, or how vehicles pass, shows one level."""

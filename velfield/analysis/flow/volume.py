@@ -167,16 +167,19 @@ def _space_mean_speed(driven: FloatArray, spent: FloatArray, at: FloatArray) -> 
 
 
 def delay_level(delay_s: Estimate, *, signalised: bool | None, partly: bool) -> str:
-    """Level of service of a mean delay: one, or those that its interval reaches; of a part of a delay at least these.
+    """Level of service of a mean delay: one, or those that its interval reaches; of a part of one at least the best.
 
     Examples
     --------
     >>> delay_level(Estimate(23.0, 17.0, 28.0, 53), signalised=True, partly=False)
     'B to C'
+    >>> delay_level(Estimate(23.0, 17.0, 28.0, 53), signalised=True, partly=True)
+    'B or worse'
     """
     best, worst = (level_of_service(max(end, 0.0), signalised=signalised) for end in (delay_s.low, delay_s.high))
-    level = best if best == worst else f"{best} to {worst}"
-    return f"{level} or worse" if partly and worst not in ("", "F") else level
+    if partly:
+        return f"{best} or worse" if best not in ("", "F") else best
+    return best if best == worst else f"{best} to {worst}"
 
 
 def level_of_service(delay_s: float, *, signalised: bool | None) -> str:

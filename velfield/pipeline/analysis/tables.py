@@ -8,7 +8,7 @@ from schemas.analysis import AnalysisTable
 from schemas.arrays import FloatArray
 from schemas.export import SpeedUnit
 from velfield.analysis.answers import TWO_LEVELS
-from velfield.analysis.approaches import ApproachDelay, approach_delays, longest_queues
+from velfield.analysis.approaches import ApproachDelay, ArmQueue, approach_delays, longest_queues
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
 from velfield.analysis.flow.volume import LaneFlow, delay_level
@@ -100,8 +100,8 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         signalised, part = analysis.is_signalised(m.junction), analysis.delay_is_partial(m.junction, m.arm_in)
         return delay_level(m.delay_s, signalised=signalised, partly=part) or None
 
-    def partly(m: Movement) -> str:
-        return "yes" if m.delay_s and analysis.delay_is_partial(m.junction, m.arm_in) else ""
+    def partly(m: Movement) -> bool:
+        return analysis.delay_is_partial(m.junction, m.arm_in)
 
     columns: list[Column[tuple[JunctionMovements, Movement]]] = [
         Column("junction", "Junction", "", lambda row: row[1].junction),
@@ -115,8 +115,14 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("flow", "Flow", "veh/h", lambda row: row[1].flow_veh_per_h),
         estimates("heavy", "Lorries and buses", "%", lambda row: analysis.heavy_share(row[0].tracks(row[1])), 100.0),
         estimates("travel_time", "Travel time", "s", lambda row: row[1].travel_time_s),
-        estimates("delay", "Delay", "s", lambda row: row[1].delay_s),
-        Column("delay_of_part", "Queues end out of view", "", lambda row: partly(row[1])),
+        estimates("delay", "Delay", "s", lambda row: None if partly(row[1]) else row[1].delay_s),
+        Column(
+            "delay_least",
+            "Delay at least",
+            "s",
+            lambda row: row[1].delay_s.low if row[1].delay_s and partly(row[1]) else None,
+            1,
+        ),
         Column("los", "Level of service", "", lambda row: service(row[1])),
     ]
     rows = ((found, m) for found in analysis.movements for m in found.movements)
@@ -124,7 +130,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         f"Arms are named by where they lead to ({analysis.arm_names.legend}). "
         "Inferred: a track is cut, and its other end follows from what enters "
         "and leaves (Furness). Delay is against the fastest tenth of those that do not stop, over the "
-        "junction and up to 150 m before it; it is longer where queues end out of view. Level of service: "
+        "junction and up to 150 m before it; where queues end out of view it is at least that. Level of service: "
         "Highway Capacity Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere; none where it is not "
         "known which."
     )
@@ -134,29 +140,40 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
 def approach_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Delay and longest queue by approach."""
-    columns: list[Column[tuple[JunctionMovements, str, ApproachDelay | None, Queue | None]]] = [
+
+    def least(queue: ArmQueue | None) -> float | None:
+        return queue.queue.vehicles.low if queue and not queue.vehicles else None
+
+    columns: list[Column[tuple[JunctionMovements, str, ApproachDelay | None, ArmQueue | None]]] = [
         Column("junction", "Junction", "", lambda row: row[0].junction.number),
         Column("from", "From", "", lambda row: row[1]),
         Column("vehicles", "Vehicles", "", lambda row: row[0].entered(row[1]), 1),
-        estimates("delay", "Delay", "s", lambda row: row[2].delay_s if row[2] else None),
-        Column("delay_of_part", "Queues end out of view", "", lambda row: "yes" if row[2] and row[2].partly else ""),
+        estimates("delay", "Delay", "s", lambda row: row[2].estimate_s if row[2] else None),
+        Column(
+            "delay_least",
+            "Delay at least",
+            "s",
+            lambda row: row[2].delay_s.low if row[2] and row[2].partly else None,
+            1,
+        ),
         Column("los", "Level of service", "", lambda row: (row[2].level or None) if row[2] else None),
-        estimates("queue", "Longest queue at a green", "vehicles", lambda row: row[3].vehicles if row[3] else None),
-        Column("queue_length", "Its length", "m", lambda row: row[3].length_m if row[3] else None, 1),
+        estimates("queue", "Longest queue", "vehicles", lambda row: row[3].vehicles if row[3] else None),
+        Column("queue_least", "Longest queue at least", "vehicles", lambda row: least(row[3])),
+        Column("queue_length", "Its length", "m", lambda row: row[3].queue.length_m if row[3] else None, 1),
     ]
 
-    def rows() -> Iterator[tuple[JunctionMovements, str, ApproachDelay | None, Queue | None]]:
+    def rows() -> Iterator[tuple[JunctionMovements, str, ApproachDelay | None, ArmQueue | None]]:
         for found in analysis.movements:
             delays = {delay.arm: delay for delay in approach_delays(analysis, found)}
             longest = longest_queues(analysis, found)
             met = analysis.ways_meet(found.junction.number)
             for arm in dict.fromkeys(m.arm_in for m in found.movements) if met else ():
-                yield found, arm, delays.get(arm), longest[arm][1] if arm in longest else None
+                yield found, arm, delays.get(arm), longest.get(arm)
 
     note = (
         "Of junctions where ways meet. Delay as in the turning counts, of all vehicles of the approach; where fewer "
-        "than three do not stop, against the pace at which they come. Queues: of the lane with the longest, where a "
-        "signal's cycle is known."
+        "than three do not stop, against the pace at which they come. Queues: of the lane with the longest, "
+        "whenever it stood, where a signal's cycle is known. At least: a queue ends out of view, or is not known."
     )
     return make_table(
         analysis, "approaches", "Movements", "Delay and queues by approach", note, columns, rows(),

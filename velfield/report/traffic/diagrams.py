@@ -163,15 +163,16 @@ def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements]
 def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
     """Delay by approach with levels of service."""
     limits = delays[0].limits_s
-    top = max(*(d.delay_s.high * 1.8 for d in delays), *limits[1:2], 1.0)
+    ends = [(d.delay_s.low,) * 3 if d.partly else (d.delay_s.value, d.delay_s.low, d.delay_s.high) for d in delays]
+    top = max(*(1.8 * high for _, _, high in ends), *limits[1:2], 1.0)
     for limit in limits:
         if limit < top:
             axes.axvline(limit, color="#8a929b", linestyle="--", linewidth=0.8, zorder=0)
-    for k, delay in enumerate(delays):
-        axes.barh(k, delay.delay_s.value, color="#5b6770", height=0.6)
-        axes.plot([delay.delay_s.low, delay.delay_s.high], [k, k], color="#1b1f24", linewidth=1.5)
+    for k, (delay, (value, low, high)) in enumerate(zip(delays, ends, strict=True)):
+        axes.barh(k, value, color="#5b6770", height=0.6)
+        axes.plot([low, high], [k, k], color="#1b1f24", linewidth=1.5)
         label = f"{delay.level}   {delay.value_text}, of {delay.delay_s.n} vehicles"
-        axes.text(delay.delay_s.high + 0.01 * top, k, label, va="center", fontsize=9, fontweight="bold",
+        axes.text(high + 0.01 * top, k, label, va="center", fontsize=9, fontweight="bold",
                   bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
     for letter, low, high in zip("ABCDEF", (0.0, *limits), (*limits, top), strict=False) if limits else ():
         if low < top:

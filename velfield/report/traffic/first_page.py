@@ -11,8 +11,9 @@ from velfield.analysis.approaches import (
     arms_without_delay,
     compare_delays,
     lane_text,
+    lanes_without_queue,
     longest_queues,
-    queue_text,
+    wait_longest,
 )
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -142,30 +143,32 @@ def _waits(
     if not longest and not delays:
         return
     place = f"junction {found.junction.number}"
-    by_length = sorted(longest, key=lambda arm: -longest[arm][1].length_m)
-    if by_length:
-        lane, queue = longest[by_length[0]]
-        others = {arm: longest[arm][1] for arm in by_length[1:]}
-        also = [arm for arm, q in others.items() if q.reaches_edge or q.vehicles.high >= queue.vehicles.low]
-        alike = f"; the longest from {list_text(also)} may be as long" if also else ""
+    if longest:
+        first, *others = longest
+        least = longest[first].queue.vehicles.low
+        open_ = set(lanes_without_queue(analysis, found)) - {first}
+        alike = open_ | {arm for arm in others if not (v := longest[arm].vehicles) or v.high >= least}
+        also = f"; the longest from {list_text(sorted(alike))} may be as long" if alike else ""
         yield (
-            f"{place}: the longest queue when green begins is from {by_length[0]}, {lane_text(found, lane)}: "
-            f"{queue_text(queue)}{alike}"
+            f"{place}: the longest queue is from {first}, {lane_text(found, longest[first].lane)}: "
+            f"{longest[first].text}{also}"
         )
-    most = [d.arm for d in delays if d.partly or d.delay_s.high >= delays[0].delay_s.low]
-    first = f"vehicles from {list_text(most)} wait longest" if len(most) < len(delays) else ""
+    most = wait_longest(delays) if delays else []
+    beyond = [d.arm for d in delays if d.partly and d.arm in most and len(most) > 1]
+    part = f"; vehicles from {list_text(beyond)} also wait out of view" if beyond else ""
+    first_of = f"vehicles from {list_text(most, 'or')} wait longest{part}" if len(most) < len(delays) else ""
     if unknown:
-        but = f"; of the others {first}" if first else ""
+        but = f"; of the others {first_of}" if first_of else ""
         yield f"{place}: which approach waits longest is not known, as the delay from {list_text(unknown)} is not{but}"
     elif len(delays) > 1:
-        yield f"{place}: {first or 'no approach is shown to wait longest'}"
-    for name in dict.fromkeys((*(delay.arm for delay in delays), *by_length)):
+        yield f"{place}: {first_of or f'no approach is shown to wait longest{part}'}"
+    for name in dict.fromkeys((*(delay.arm for delay in delays), *longest)):
         said = [count_text(found.entered(name), "vehicle")]
         said += [f"mean delay {delay.text}" for delay in delays if delay.arm == name] or [
             f"delay not known, with {found.timed(name)} vehicles seen from 60 m before the junction to behind it"
         ]
         if name in longest:
-            said.append(f"longest queue {queue_text(longest[name][1])}")
+            said.append(f"longest queue {longest[name].text}")
         yield f"from {name}: " + "; ".join(said)
 
 
