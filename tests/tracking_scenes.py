@@ -104,22 +104,6 @@ def draw(ground: FloatArray, cars: Sequence[Car], time_s: float) -> FloatArray:
     return cv2.resize(image, (image.shape[1] // o, image.shape[0] // o), interpolation=cv2.INTER_AREA)
 
 
-def patches_of(
-    image: FloatArray, xy: FloatArray, axis: FloatArray, width: int = 8, length: int = 16
-) -> NDArray[np.uint8]:
-    """Oriented patches, the axis along their rows' order."""
-    if not len(xy):
-        return np.zeros((0, length, width), np.uint8)
-    along, across = np.arange(length) - (length - 1) / 2, np.arange(width) - (width - 1) / 2
-    cos, sin = np.cos(axis)[:, None, None], np.sin(axis)[:, None, None]
-    x = xy[:, 0, None, None] + along[None, :, None] * cos - across[None, None, :] * sin
-    y = xy[:, 1, None, None] + along[None, :, None] * sin + across[None, None, :] * cos
-    flat = cv2.remap(
-        image, x.reshape(-1, width).astype(np.float32), y.reshape(-1, width).astype(np.float32), cv2.INTER_LINEAR
-    )
-    return np.clip(np.rint(flat), 0, 255).astype(np.uint8).reshape(-1, length, width)
-
-
 def crops_of(image: FloatArray, xy: FloatArray) -> NDArray[np.uint8]:
     """Upright crops centred on the rounded positions."""
     padded = np.pad(np.clip(np.rint(image), 0, 255).astype(np.uint8), CROP_PX, mode="edge")
@@ -167,7 +151,6 @@ def watch(
                 orientation_rad=axis,
                 orientation_sd_rad=np.full(len(xy), detector.axis_sd_rad),
                 score=np.ones(len(xy)),
-                patches=patches_of(image, xy, axis),
                 crops=crops_of(image, xy),
                 x_work=xy[:, 0],
                 y_work=xy[:, 1],

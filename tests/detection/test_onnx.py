@@ -360,7 +360,7 @@ def test_a_run_detects_with_it_on_raw_frames(copy: Path, tmp_path: Path, monkeyp
     found = np.column_stack([block.cars.column["x_px"], block.cars.column["y_px"]])
     assert sorted_rows(found.round(1)) == sorted_rows(expected[np.isfinite(expected[:, 0])].round(1))
     assert block.searched.tolist() == [1.0]
-    assert set(block.cars.crops) == {"patches", "chips", "strips", "xy_work", "sizes"}
+    assert set(block.cars.crops) == {"chips", "strips", "xy_work", "sizes"}
     assert set(block.weak.crops) == {"chips", "strips", "xy_work", "sizes"}, "what is written of weak candidates"
 
 

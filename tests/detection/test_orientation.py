@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from velfield.detection.crops import oriented_patches, upright_chips
+from velfield.detection.crops import oriented_patches, patches_of_chips, upright_chips
 from velfield.detection.orientation import (
     axial_difference,
     contradict_axes,
@@ -120,6 +120,14 @@ def test_crops_are_those_of_whole_grids() -> None:
     padded = np.pad(image, 32, mode="edge")
     for chip, (left, top) in zip(upright_chips(image, xy), np.rint(xy).astype(int) + 16, strict=True):
         np.testing.assert_array_equal(chip, padded[top : top + 32, left : left + 32])
+
+
+def test_patches_are_cut_out_of_the_chips_as_out_of_the_image() -> None:
+    rng = np.random.default_rng(8)
+    image = rng.integers(0, 256, (90, 120)).astype(np.uint8)
+    xy, axes = rng.uniform(16, 74, (1500, 2)), rng.uniform(0, np.pi, 1500)
+    found = patches_of_chips(upright_chips(image, xy), xy - np.rint(xy), axes)
+    assert np.abs(found.astype(int) - oriented_patches(image, xy, axes)).max() <= 8  # positions of 32 bits, rounded
 
 
 def test_no_positions_give_no_crops() -> None:

@@ -95,7 +95,7 @@ def test_another_detector_is_trained_and_run_by_its_name() -> None:
     assert detector.record.cars == 9
     found = detect_frame(sample.image, None, detector)
     assert found.xy.tolist() == sample.cars[:, :2].tolist()  # top to bottom
-    assert found.patches.shape == (9, 16, 8)
+    assert found.chips.shape == (9, 32, 32)
     assert len(detector.detect(sample.image, threshold=250)) == 0
 
 

@@ -8,7 +8,6 @@ from velfield.tracking.appearance import (
     CAR_LENGTH_PX,
     CAR_WIDTH_PX,
     MAX_CROP_SHIFT_PX,
-    AppearanceFeatures,
     appearance_differences,
     crop_differences,
     patch_differences,
@@ -101,8 +100,7 @@ def test_patches_of_any_size_are_compared() -> None:
 
 
 def test_the_difference_to_an_unknown_appearance_is_unknown() -> None:
-    unknown, patches = AppearanceFeatures(None, None), AppearanceFeatures(PATCHES, None)
     one = np.zeros(1, np.int64)
-    assert np.isnan(appearance_differences(unknown, patches, one, one)).all()
-    both = AppearanceFeatures(PATCHES, prepare_crops(CROPS, AXES))
-    assert appearance_differences(patches, both, one, one) == 0  # by the patches, which both have
+    for known in (PATCHES, prepare_crops(CROPS, AXES)):
+        assert np.isnan(appearance_differences(None, known, one, one)).all()
+        assert appearance_differences(known, known, one, one) == 0

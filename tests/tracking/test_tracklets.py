@@ -189,7 +189,7 @@ def test_positions_alone_give_tracklets() -> None:
     rng = np.random.default_rng(6)
     cars = [car(rng, (x, y), (50.0, 0.0)) for x, y in [(20.0, 30.0), (80.0, 60.0), (140.0, 90.0), (60.0, 120.0)]]
     seen = watch(cars, uneven_times(rng, 8), rng=rng, detector=Detector(recall=1.0, false_alarms=0.0))
-    unknown = {"patches": None, "crops": None, "x_work": None, "y_work": None}
+    unknown = {"crops": None, "x_work": None, "y_work": None}
     bare = [
         replace(t, orientation_rad=t.x_px * np.nan, orientation_sd_rad=t.x_px * np.nan, **unknown) for t in seen.tables
     ]
@@ -207,7 +207,7 @@ def _split(seen: Watched, weak_cars: set[int]) -> tuple[list[FrameTable], list[F
     for table in seen.tables:
         is_weak = np.array([seen.car_of[one] in weak_cars for one in table.detection_id.tolist()], bool)
         sure.append(table.take(np.flatnonzero(~is_weak)))
-        weak.append(replace(table.take(np.flatnonzero(is_weak)), patches=None, score=np.full(is_weak.sum(), 0.01)))
+        weak.append(replace(table.take(np.flatnonzero(is_weak)), score=np.full(is_weak.sum(), 0.01)))
     return sure, weak
 
 

@@ -80,6 +80,25 @@ def _chips_kernel(image: ByteArray, corners: IntArray, side: int) -> ByteArray:
     return out
 
 
+def patches_of_chips(chips: GreyImage, offset_px: FloatArray, orientation_rad: FloatArray) -> GreyImage:
+    """Oriented patches (n, 16, 8) uint8 of cars by their upright chips, which they do not reach beyond.
+
+    Parameters
+    ----------
+    chips
+        (n, 32, 32) uint8, as of `upright_chips`.
+    offset_px, orientation_rad
+        (n, 2) centres from the rounded positions, and (n,) axes.
+    """
+    parts = [np.empty((0, 16, 8), np.uint8)]
+    for start in range(0, len(chips), 1000):  # one below the other: remap takes images of less than 32,767 rows
+        some = slice(start, start + 1000)
+        top = CHIP_PX * np.arange(len(chips[some]))
+        xy = CHIP_PX // 2 + offset_px[some] + np.column_stack([np.zeros(len(top)), top])
+        parts.append(oriented_patches(chips[some].reshape(-1, CHIP_PX), xy, orientation_rad[some]))
+    return np.concatenate(parts)
+
+
 def oriented_strips(half_image: GreyImage, xy: FloatArray, orientation_rad: FloatArray) -> GreyImage:
     """Patches of twice a bus's length at half the resolution, the axis along the columns: (n, 32, 10) uint8.
 

@@ -11,8 +11,8 @@ compared by cells of 8 px. A detection is kept only while nothing within the len
 slow bus looks the same before and after.
 
 The image is on the working grid: the base image's grid, scaled so that a car is ``working_car_length_px`` long. The
-crops (`attach_crops`) are patches rotated to the axis, to compare appearance, upright chips, to align, and strips at
-half the resolution along the axis, to compare vehicles up to the length of a bus. Detections of a detector that does
+crops (`attach_crops`) are upright chips, to compare and to align, and strips at half the resolution along the axis, to
+compare vehicles up to the length of a bus. Detections of a detector that does
 not measure vehicles are measured by the network that ships (`with_sizes`).
 
 Candidates of a lower score than a detection's are kept apart (`SearchedFrame.weak`): where a track shows that a vehicle
@@ -37,7 +37,7 @@ from velfield.detection.changes import (
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.inference import Predictor
 from velfield.detection.cnn.model import VIEW_REACH_PX, measure_vehicles
-from velfield.detection.crops import CHIP_PX, oriented_patches, oriented_strips, upright_chips
+from velfield.detection.crops import CHIP_PX, oriented_strips, upright_chips
 from velfield.detection.frame import SearchableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.mosaic import CROP_UNIT_PX, find_in_boxes
@@ -65,10 +65,8 @@ and kept detections make tracklets: precision 0.984 with all kept, 0.988 without
 
 @dataclass(frozen=True)
 class FrameDetections(Detections):
-    """Cars of a frame, and their patches."""
+    """Cars of a frame, and their crops."""
 
-    patches: GreyImage
-    """(n, 16, 8) uint8, rotated to the axis."""
     chips: GreyImage
     """(n, 32, 32) uint8, upright about the rounded position."""
     strips: GreyImage
@@ -106,7 +104,7 @@ def detect_frame(image: GreyImage, valid: Mask | None, detector: Detector) -> Fr
 def attach_crops(
     image: GreyImage, cars: Detections, order: IntArray | slice = slice(None), *, half_image: GreyImage | None = None
 ) -> FrameDetections:
-    """Detections in an order, with their patches; the image at half its resolution is made where it is not given."""
+    """Detections in an order, with their crops; the image at half its resolution is made where it is not given."""
     half = half_resolution(image) if half_image is None else half_image
     xy, axis = np.ascontiguousarray(cars.xy[order]), np.ascontiguousarray(cars.orientation_rad[order])
     return FrameDetections(
@@ -116,7 +114,6 @@ def attach_crops(
         area_px=cars.area_px[order],
         score=cars.score[order],
         sizes=cars.sizes[order],
-        patches=oriented_patches(image, xy, axis),
         chips=upright_chips(image, xy),
         strips=oriented_strips(half, xy, axis),
     )

@@ -31,26 +31,6 @@ _HALF_SIDE, _PART = 16, 256
 """Side and size of a part of a crop."""
 
 
-@dataclass(frozen=True)
-class AppearanceFeatures:
-    """Appearance of the detections of one frame: crops, otherwise patches, otherwise unknown."""
-
-    patches: ByteArray | None
-    crops: "PreparedCrops | None"
-
-
-def appearance_differences(
-    before: AppearanceFeatures, after: AppearanceFeatures, first: IntArray, second: IntArray
-) -> FloatArray:
-    """Appearance difference of pairs of detections, (k,) grey levels: of crops where both frames have them, otherwise
-    of patches; NaN where neither."""
-    if before.crops is not None and after.crops is not None:
-        return crop_differences(before.crops, after.crops, first, second)
-    if before.patches is not None and after.patches is not None:
-        return patch_differences(before.patches, after.patches, first, second)
-    return np.full(first.size, np.nan)
-
-
 def patch_differences(
     before: ByteArray,
     after: ByteArray,
@@ -129,6 +109,21 @@ def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> PreparedCrops:
     odd = np.asarray(on_car[:, 1::2].any(axis=2))
     rows = np.stack([odd.argmax(axis=1), _HALF_SIDE - odd[:, ::-1].argmax(axis=1)], axis=1)
     return PreparedCrops(parts.reshape(len(crops), 4, 4, _PART), spare, rows)
+
+
+Appearance = PreparedCrops | ByteArray
+"""Of the detections of one frame: their crops, or oriented patches (n, length, width) uint8."""
+
+
+def appearance_differences(
+    before: Appearance | None, after: Appearance | None, first: IntArray, second: IntArray
+) -> FloatArray:
+    """Appearance difference of pairs of detections, (k,) grey levels; NaN where one frame's appearance is unknown."""
+    if isinstance(before, PreparedCrops) and isinstance(after, PreparedCrops):
+        return crop_differences(before, after, first, second)
+    if isinstance(before, np.ndarray) and isinstance(after, np.ndarray):
+        return patch_differences(before, after, first, second)
+    return np.full(first.size, np.nan)
 
 
 def _car_masks(axis_rad: FloatArray) -> Mask:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
 from schemas.tables import TRACKLET_COLUMNS
+from velfield.detection.crops import patches_of_chips
 from velfield.tracking.crop_alignment import UprightCrops, refine_links
 from velfield.tracking.gates import DetectionStates, Limits
 
@@ -46,11 +47,9 @@ class FrameTable:
     orientation_sd_rad: FloatArray
     score: FloatArray
     """(n,) as in the detections' table. Orientations may be NaN."""
-    patches: ByteArray | None = None
-    """(n, length, width) uint8 oriented patches in working px; None: appearance is not used."""
     crops: ByteArray | None = None
-    """(n, 32, 32) uint8 upright crops in working px, centred on ``round(x_work), round(y_work)``; None: displacements
-    are not refined."""
+    """(n, 32, 32) uint8 upright crops in working px, centred on ``round(x_work), round(y_work)``; None: appearance is
+    not used, and displacements are not refined."""
     x_work: FloatArray | None = None
     y_work: FloatArray | None = None
     """(n,) positions in working px of this frame's rectified image; with ``crops`` only."""
@@ -64,7 +63,7 @@ class FrameTable:
         return self._with_arrays(lambda name: None if (array := getattr(self, name)) is None else array[rows])
 
     def with_weak(self, weak: "FrameTable") -> "FrameTable":
-        """The detections, then the weak candidates of the same frame; without patches, which those lack."""
+        """The detections, then the weak candidates of the same frame."""
 
         def join(name: str) -> NDArray[Any] | None:
             both = getattr(self, name), getattr(weak, name)
@@ -87,6 +86,13 @@ class FrameTable:
             time_s=self.time_s,
         )
 
+    def oriented_patches(self) -> ByteArray | None:
+        """(n, 16, 8) uint8 patches in working px with the axis along the columns, cut out of the crops."""
+        if self.crops is None or self.x_work is None or self.y_work is None:
+            return None
+        xy = np.column_stack([self.x_work, self.y_work])
+        return patches_of_chips(self.crops, xy - np.rint(xy), np.asarray(self.orientation_rad, np.float64))
+
     def upright_crops(self) -> UprightCrops | None:
         """The upright crops with their centres in base px."""
         if self.crops is None or self.x_work is None or self.y_work is None:
@@ -102,7 +108,7 @@ class FrameTable:
 
 _ARRAYS = (
     *("detection_id", "x_px", "y_px", "orientation_rad", "orientation_sd_rad", "score"),
-    *("patches", "crops", "x_work", "y_work"),
+    *("crops", "x_work", "y_work"),
 )
 """Attributes of `FrameTable` with a row a detection."""
 

@@ -19,7 +19,7 @@ from scipy.special import expit, logit
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import TrackingConfig, assumed_gsd_m
 from velfield.errors import InputError
-from velfield.tracking.appearance import AppearanceFeatures, appearance_differences, prepare_crops
+from velfield.tracking.appearance import Appearance, appearance_differences, prepare_crops
 from velfield.tracking.association import (
     MAX_COST,
     FrameTable,
@@ -61,20 +61,22 @@ class _Frames:
         self.limits = limits
         self.config = config
         self.states: list[DetectionStates] = [t.states(limits) for t in tables]
-        self._features: dict[int, AppearanceFeatures] = {}
+        self._features: dict[int, Appearance | None] = {}
         self._pairs: dict[int, _FramePair] = {}
 
     def adjacent(self, i: int) -> bool:
         """Whether frame i and the next may be in one window. An interval of zero has no velocity."""
         return 0.0 < self.tables[i + 1].time_s - self.tables[i].time_s <= self.limits.max_interval_s
 
-    def features(self, i: int) -> AppearanceFeatures:
-        """Appearance of the detections of frame i; pairwise linking, as in the paper, uses the patches only."""
+    def features(self, i: int) -> Appearance | None:
+        """Appearance of the detections of frame i: crops, or for pairwise linking, as in the paper, patches."""
         if i not in self._features:
             table = self.tables[i]
-            crops = None if self.config.linking == "pairwise" else table.crops
-            prepared = None if crops is None else prepare_crops(crops, self.states[i].axis_rad)
-            self._features[i] = AppearanceFeatures(table.patches, prepared)
+            if self.config.linking == "pairwise":
+                self._features[i] = table.oriented_patches()
+            else:
+                crops = table.crops
+                self._features[i] = None if crops is None else prepare_crops(crops, self.states[i].axis_rad)
         return self._features[i]
 
     def pair(self, i: int) -> _FramePair:
@@ -260,7 +262,7 @@ def _moving_vehicle(score: FloatArray, likely: FloatArray) -> FloatArray:
 
 
 def _triples(
-    first: AppearanceFeatures, last: AppearanceFeatures, before: _FramePair, after: _FramePair, pairs: LinkPairs
+    first: Appearance | None, last: Appearance | None, before: _FramePair, after: _FramePair, pairs: LinkPairs
 ) -> tuple[IntArray, FloatArray]:
     """(m, 3) detections and (m,) cost, as of `best_triples`."""
     a = before.links.first[pairs.link_01]

@@ -3,7 +3,7 @@
 Detections of another program in place of ours (`--detections`): later stages do not know the difference.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -245,25 +245,22 @@ def _detector(path: Path, _key: str) -> Detector:
 
 
 _NO_CROPS: dict[str, NDArray[Any]] = {
-    "patches": np.empty((0, 16, 8), np.uint8),
     "chips": np.empty((0, 32, 32), np.uint8),
     "strips": np.empty((0, 32, 10), np.uint8),
     "xy_work": np.empty((0, 2)),
     "sizes": np.empty((0, 4), np.float32),
 }
-_WEAK_CROPS = ("chips", "strips", "xy_work", "sizes")
-"""Arrays of weak candidates: patches serve the linking of detections alone."""
 
 
 def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:
     """Frames as two tables, of the cars and of the weak candidates."""
-    cars = _select_rows(parts, [slice(0, found.cars) for *_, found in parts], _NO_CROPS)
-    weak = _select_rows(parts, [slice(found.cars, None) for *_, found in parts], _WEAK_CROPS)
+    cars = _select_rows(parts, [slice(0, found.cars) for *_, found in parts])
+    weak = _select_rows(parts, [slice(found.cars, None) for *_, found in parts])
     return BlockDetections(cars, weak, np.array([found.searched for *_, found in parts]))
 
 
-def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice], names: Iterable[str]) -> Cars:
-    """Some rows of each frame, as one table, and their crops of these names: a table a frame cost 4 ms a frame."""
+def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice]) -> Cars:
+    """Some rows of each frame, as one table, and their crops: a table a frame cost 4 ms a frame."""
     all_found = [found for *_, found in parts]
     detections = [one.detections for one in all_found]
     number = [np.arange(len(one))[some] for one, some in zip(detections, rows, strict=True)]
@@ -287,7 +284,7 @@ def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice], names: Iter
         "area_px": join([one.area_px for one in detections]) / repeat([one.scale for one in all_found], "float64") ** 2,
         "score": join([one.score for one in detections]),
     }
-    crops: dict[str, list[NDArray[Any]]] = {name: [_NO_CROPS[name]] for name in names}
+    crops: dict[str, list[NDArray[Any]]] = {name: [none] for name, none in _NO_CROPS.items()}
     for one, some in zip(detections, rows, strict=True):
         for name in crops:
             values = one.xy if name == "xy_work" else getattr(one, name)
@@ -300,9 +297,9 @@ def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections
     unit = frames.start // plan.unit_frames
     scale = read_working(plan.layout).scale
     cars, weak = [block.cars for block in blocks], [block.weak for block in blocks]
-    written = _write_part(plan.layout.unit_file(plan.layout.detections, unit), cars, scale, _NO_CROPS)
+    written = _write_part(plan.layout.unit_file(plan.layout.detections, unit), cars, scale)
     path = plan.layout.unit_file(plan.layout.weak_detections, unit)
-    written += _write_part(path, weak, scale, _WEAK_CROPS)
+    written += _write_part(path, weak, scale)
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
     counts = {"frames": float(used), "cars": float(sum(map(len, cars))), "weak": float(sum(map(len, weak)))}
     searched = np.concatenate([block.searched for block in blocks])
@@ -311,9 +308,9 @@ def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections
     return StageResult(written, counts)
 
 
-def _write_part(path: Path, parts: Sequence[Cars], scale: float, crops: Iterable[str]) -> list[Path]:
+def _write_part(path: Path, parts: Sequence[Cars], scale: float) -> list[Path]:
     """Write the table of a unit's blocks, and those of their crops."""
-    arrays = {name: [array for part in parts for array in part.crops[name]] for name in crops}
+    arrays = {name: [array for part in parts for array in part.crops[name]] for name in _NO_CROPS}
     patches = path.with_suffix(".patches.npz")
     write_arrays(patches, {**arrays, "working_scale": np.array(scale)})
     columns = {name: np.concatenate([part.column[name] for part in parts]) for name in DETECTION_COLUMNS}

@@ -20,6 +20,7 @@ from velfield.tracking.association import FrameTable, window_frames
 from velfield.tracking.tracklets import link_windows
 
 _READ = ["detection_id", "frame", "x_px", "y_px", "orientation_rad", "orientation_sd_rad", "score"]
+_CROPS = ["chips", "xy_work", "working_scale"]
 
 
 def tracklet_files(plan: Plan) -> list[Path]:
@@ -95,23 +96,22 @@ def has_lost_detections(plan: Plan, unit: int) -> bool:
 
 @dataclass(frozen=True)
 class UnitDetections:
-    """Detections of a unit of frames: ``column``, their columns by name, (n,) each, and ``patches``, (n, ...) each."""
+    """Detections of a unit of frames: ``column``, their columns by name, (n,) each, and ``crops``, (n, ...) each."""
 
     column: dict[str, np.ndarray]
-    patches: Arrays
+    crops: Arrays
 
 
 def read_unit(plan: Plan, unit: int, *, weak: bool) -> UnitDetections:
-    """Detections of a unit and their patches, or its weak candidates, which have none."""
+    """Detections of a unit and their crops, or its weak candidates."""
     path = plan.layout.unit_file(plan.layout.weak_detections if weak else plan.layout.detections, unit)
     table = read_tables([path], DETECTION_COLUMNS, only=_READ)
-    names = ["chips", "xy_work", "working_scale"] if weak else ["patches", "chips", "xy_work", "working_scale"]
-    patches = read_arrays(path.with_suffix(".patches.npz"), only=names)
-    return UnitDetections({name: table[name].to_numpy() for name in _READ}, patches)
+    crops = read_arrays(path.with_suffix(".patches.npz"), only=_CROPS)
+    return UnitDetections({name: table[name].to_numpy() for name in _READ}, crops)
 
 
 def read_chosen(plan: Plan, unit: int, ids: IntArray) -> UnitDetections:
-    """Read a unit's detections and weak candidates that have one of the given ids, with their chips but no patches.
+    """Read a unit's detections and weak candidates that have one of the given ids, with their crops.
 
     ``ids`` (n,) ascending. The weak ones come after the others.
     """
@@ -120,13 +120,11 @@ def read_chosen(plan: Plan, unit: int, ids: IntArray) -> UnitDetections:
         path = layout.unit_file(folder, unit)
         table = read_tables([path], DETECTION_COLUMNS, only=_READ)
         rows = np.flatnonzero(among(table["detection_id"].to_numpy(), ids))
-        patches = read_arrays(path.with_suffix(".patches.npz"), only=["chips", "xy_work", "working_scale"])
+        crops = read_arrays(path.with_suffix(".patches.npz"), only=_CROPS)
         column = {name: table[name].to_numpy()[rows] for name in _READ}
-        parts.append((column, {name: patches[name][rows] for name in ("chips", "xy_work")}, patches["working_scale"]))
-    column, patches = (
-        {name: np.concatenate([part[k][name] for part in parts]) for name in parts[0][k]} for k in (0, 1)
-    )
-    return UnitDetections(column, {**patches, "working_scale": parts[0][2]})
+        parts.append((column, {name: crops[name][rows] for name in ("chips", "xy_work")}, crops["working_scale"]))
+    column, crops = ({name: np.concatenate([part[k][name] for part in parts]) for name in parts[0][k]} for k in (0, 1))
+    return UnitDetections(column, {**crops, "working_scale": parts[0][2]})
 
 
 def among(values: IntArray, ascending: IntArray) -> Mask:
@@ -170,7 +168,7 @@ def _frame_table(
     residual_px: float,
     map_sd_px: float,
 ) -> FrameTable:
-    rows, patches = np.flatnonzero(unit.column["frame"] == frame), unit.patches
+    rows, crops = np.flatnonzero(unit.column["frame"] == frame), unit.crops
     return FrameTable(
         frame=frame,
         time_s=time_s,
@@ -182,10 +180,9 @@ def _frame_table(
         orientation_rad=unit.column["orientation_rad"][rows].astype(np.float64),
         orientation_sd_rad=unit.column["orientation_sd_rad"][rows].astype(np.float64),
         score=unit.column["score"][rows].astype(np.float64),
-        patches=patches["patches"][rows] if "patches" in patches else None,
-        crops=patches["chips"][rows],
-        x_work=patches["xy_work"][rows, 0],
-        y_work=patches["xy_work"][rows, 1],
-        working_scale=float(patches["working_scale"]),
+        crops=crops["chips"][rows],
+        x_work=crops["xy_work"][rows, 0],
+        y_work=crops["xy_work"][rows, 1],
+        working_scale=float(crops["working_scale"]),
         registration_sd_px=map_sd_px,
     )
