@@ -183,7 +183,7 @@ def test_a_measured_vehicle_has_its_own_box_and_class(run: Run, tmp_path: Path) 
 
 
 def test_a_table_with_a_reference_system_has_coordinates(run: Run) -> None:
-    from velfield.exports.roads.table import trajectory_table
+    from velfield.exports.tracks.table import trajectory_table
 
     affine = (GSD_M, 0.0, 700_000.0, 0.0, -GSD_M, 3_500_000.0)
     placed = Run(run.layout, run.record)

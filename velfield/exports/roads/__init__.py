@@ -1,1 +1,1 @@
-"""Lanes and the vehicles on them for other programs: SUMO, OpenDRIVE, tables of trajectories."""
+"""Lanes for other programs: SUMO, OpenDRIVE."""

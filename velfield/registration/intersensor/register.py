@@ -52,8 +52,6 @@ _MIN_ROW_CORRECTED_FRACTION = 0.45
 _MIN_BASE_CONTRAST_GREY = 1.0
 _ROW_BANDS, _MIN_ROW_POINTS = 64, 8
 """Rows within a 64th of the frame are exposed at about the same time; their motion is the median of so many points."""
-_NEAR_SCALES = (0.8, 0.89, 1.0, 1.12, 1.25)
-_NEAR_ROTATIONS = tuple(np.radians([-10.0, -5.0, 0.0, 5.0, 10.0]))
 _ALL_SCALES = (0.5, 0.63, 0.79, 1.0, 1.26, 1.59, 2.0)
 _ALL_ROTATIONS = tuple(np.radians(np.arange(0.0, 360.0, 10.0)))
 _FINER_SCALES = (0.87, 0.93, 1.0, 1.07, 1.15)
@@ -92,18 +90,16 @@ def register_intersensor(
     config: BaseConfig,
     *,
     lens: Lens,
-    initial: FloatArray | None = None,
 ) -> IntersensorResult | Failure:
     """Register a raw frame (h, w) uint8 to another sensor's image (H, W) uint8.
 
-    ``initial`` (3, 3), undistorted frame px -> base px, is tried first; it is accurate to a fifth in scale and ten
-    degrees. A failure's reason is one line; each candidate's scores go to this module's logger, at level DEBUG.
+    A failure's reason is one line; each candidate's scores go to this module's logger, at level DEBUG.
     """
     if float(base.std()) < _MIN_BASE_CONTRAST_GREY:
         return Failure("found an image of one grey level, expected one of the flight's area; give another")
     pair = ImagePair(image, base, lens, config)
     scores: list[str] = []
-    for candidate in _coarse_candidates(pair, initial, scores):
+    for candidate in _coarse_candidates(pair, scores):
         fit = register_coarse_to_fine(pair, candidate)
         if isinstance(fit, Failure):
             scores.append(f"{candidate.method}: {fit.reason}")
@@ -131,11 +127,8 @@ def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
     )
 
 
-def _coarse_candidates(pair: ImagePair, initial: FloatArray | None, scores: list[str]) -> Iterator[CoarseCandidate]:
+def _coarse_candidates(pair: ImagePair, scores: list[str]) -> Iterator[CoarseCandidate]:
     """Coarse maps, the most likely first, the slow search last; ``scores`` records the methods that gave none."""
-    if initial is not None:
-        near = np.asarray(initial, dtype=np.float64)
-        yield from _search_candidates(pair, "given", (_NEAR_SCALES, _NEAR_ROTATIONS), near, scores)
     for modality in MODALITIES.values():
         if modality.sift_transform is None:
             continue
@@ -146,20 +139,14 @@ def _coarse_candidates(pair: ImagePair, initial: FloatArray | None, scores: list
             continue
         yield CoarseCandidate(sift.matrix, method, modality, sift.inliers / sift.matches)
         yield CoarseCandidate(sift.matrix, f"{method}, then {GRADIENT.name}", GRADIENT, sift.inliers / sift.matches)
-    yield from _search_candidates(pair, "search", (_ALL_SCALES, _ALL_ROTATIONS), None, scores)
+    yield from _search_candidates(pair, scores)
 
 
-def _search_candidates(
-    pair: ImagePair,
-    method: str,
-    grid: tuple[tuple[float, ...], tuple[float, ...]],
-    initial: FloatArray | None,
-    scores: list[str],
-) -> Iterator[CoarseCandidate]:
+def _search_candidates(pair: ImagePair, scores: list[str]) -> Iterator[CoarseCandidate]:
     """The best of a search over scales and rotations in each modality, each refined by a finer search."""
-    found = search_similarity(pair.image, pair.base, pair.lens, scales=grid[0], rotations_rad=grid[1], initial=initial)
+    found = search_similarity(pair.image, pair.base, pair.lens, scales=_ALL_SCALES, rotations_rad=_ALL_ROTATIONS)
     if not found:
-        scores.append(f"{method}: no fit at any rotation and scale")
+        scores.append("search: no fit at any rotation and scale")
     for rough in found:
         finer = search_similarity(
             pair.image,
@@ -172,8 +159,8 @@ def _search_candidates(
         )
         for fine in finer:
             if fine.modality == rough.modality:
-                described = f"{method} ({fine.modality.name}), correlation {fine.score:.2f}"
-                yield CoarseCandidate(fine.matrix, described, fine.modality, fine.score, is_blind=initial is None)
+                described = f"search ({fine.modality.name}), correlation {fine.score:.2f}"
+                yield CoarseCandidate(fine.matrix, described, fine.modality, fine.score, is_blind=True)
 
 
 @dataclass(frozen=True)

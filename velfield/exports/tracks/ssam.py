@@ -12,7 +12,7 @@ import pandas as pd
 from schemas.arrays import FloatArray
 from schemas.export import ExportOptions
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M, VEHICLE_WIDTH_M
-from velfield.exports.roads.table import trajectory_table
+from velfield.exports.tracks.table import trajectory_table
 from velfield.run.run import Run
 
 FILE_NAME = "trajectories.trj"

@@ -1,13 +1,13 @@
 """Trajectories as Parquet, or as CSV where the file is named so.
 
-The columns are those of `velfield.exports.roads.table.trajectory_table`.
+The columns are those of `velfield.exports.tracks.table.trajectory_table`.
 """
 
 import io
 from pathlib import Path
 
 from schemas.export import ExportOptions
-from velfield.exports.roads.table import trajectory_table
+from velfield.exports.tracks.table import trajectory_table
 from velfield.run.run import Run
 
 FILE_NAME = "trajectories.parquet"

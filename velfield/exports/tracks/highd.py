@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.export import ExportOptions
-from velfield.exports.roads.table import trajectory_table
+from velfield.exports.tracks.table import trajectory_table
 from velfield.run.run import Run
 
 FILE_NAME = "tracks-highd.csv"
