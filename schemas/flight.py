@@ -235,7 +235,7 @@ class FlightConfig(Model):
     """The set of defaults that this configuration started from."""
     gsd_m: float | None = Field(None, ge=0.001, le=5)
     """Ground sample distance of the base image, m a pixel; None: from its CRS, the metadata or the vehicles."""
-    position_unit: Literal["m", "ft", "px", "deg"] | None = None
+    position_unit: Literal["m", "ft", "cm", "mm", "px", "deg"] | None = None
     """Unit of the columns x and y of `velfield run --tracks`, where their names do not say it."""
     position_y_axis: Literal["up", "down"] | None = None
     """Where y points in the tracks of `velfield run --tracks`: up (north) or down, where the format does not say it."""

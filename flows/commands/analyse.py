@@ -12,7 +12,7 @@ def analyse(
     out: Path | None = None,
     gsd_m: float | None = None,
     fps: float | None = None,
-    unit: Literal["m", "ft", "px", "deg"] | None = None,
+    unit: Literal["m", "ft", "cm", "mm", "px", "deg"] | None = None,
     y_axis: Literal["up", "down"] | None = None,
     slice_s: float = 300.0,
     speed_unit: Literal["km/h", "mph"] = "km/h",

@@ -38,7 +38,7 @@ def run(
     *more: Path,
     out: Path,
     tracks: Path | None = None,
-    unit: Literal["m", "ft", "px", "deg"] | None = None,
+    unit: Literal["m", "ft", "cm", "mm", "px", "deg"] | None = None,
     y_axis: Literal["up", "down"] | None = None,
     base: Path | None = None,
     gsd_m: float | None = None,

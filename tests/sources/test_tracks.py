@@ -281,3 +281,32 @@ def test_columns_without_a_number_or_a_length_are_named(tmp_path: Path) -> None:
     table.assign(utm_x=np.nan).to_csv(tmp_path / "empty.csv", index=False)
     with pytest.raises(InputError, match="found no number in columns utm_x and utm_y"):
         load(tmp_path / "empty.csv", {})
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 0.001), ("cm", 0.01), ("ft", 0.3048)])
+def test_a_unit_read_as_metres_is_named_by_the_speeds(tmp_path: Path, unit: str, metres: float) -> None:
+    """Twelve vehicles at 60 km/h, and at 110 km/h, of which metres are plausible."""
+    rows = [(k, 3.0 * k + t, 60 / 3.6 * t, 4.0 * (k % 2)) for k in range(12) for t in np.arange(0, 12, 0.2)]
+    table = pd.DataFrame(rows, columns=["id", "time_s", "x", "y"])
+    path = tmp_path / "t.csv"
+    table.assign(x=table["x"] / metres, y=table["y"] / metres).to_csv(path, index=False)
+    loaded, said = outcome(path, {"unit": "m", "y_axis": "up"})
+    assert f"--unit {unit} makes it 60 km/h" in said
+    assert (loaded is not None) == (unit == "ft")  # 197 km/h may be real
+    loaded, said = outcome(path, {"unit": unit, "y_axis": "up"})
+    assert loaded is not None
+    assert said == ""
+    table.assign(x=table["x"] * 110 / 60).to_csv(path, index=False)
+    assert outcome(path, {"unit": "m", "y_axis": "up"})[1] == ""
+
+
+@pytest.mark.parametrize("by_time", [False, True])
+def test_rows_that_descend_in_time_are_reported(tmp_path: Path, by_time: bool) -> None:
+    t = vehicles()
+    table = pd.DataFrame({"track_id": t["id"], "time_s": t["t"], "x_m": t["east"], "y_m": t["north"]})
+    table = table.sort_values("time_s") if by_time else table
+    back = table.assign(time_s=table["time_s"].max() - table["time_s"])
+    for one, reported in ((table, False), (back, True), (table.sample(frac=1.0, random_state=1), False)):
+        one.to_csv(tmp_path / "t.csv", index=False)
+        found = [note for note in load(tmp_path / "t.csv", {}).notes if "descending order of time" in note]
+        assert [note.startswith("warning: the rows of 8 of 8 tracks") for note in found] == [True] * reported

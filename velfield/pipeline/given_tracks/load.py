@@ -13,7 +13,7 @@ from velfield.analysis.speed_changes import PLAUSIBLE_M_PER_S2, check_times
 from velfield.analysis.trajectories import make_trajectories
 from velfield.errors import InputError
 from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd, true_north_rad
-from velfield.sources.tracks.checks import check_speeds, check_standing_gaps, require_motion, split_reused
+from velfield.sources.tracks.checks import check_motion, check_speeds, check_standing_gaps, split_reused
 from velfield.sources.tracks.read import GivenPositions, read_tracks
 from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
 
@@ -107,9 +107,9 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     table = given.table.rename(columns={"x": "x_px", "y": "y_px"})
     table[["x_px", "y_px"]] = (table[["x_px", "y_px"]] - corner) * to_px
     xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd_m
+    notes = [*given.notes, *check_speeds(path, table, xy_m, given.speed, config.position_unit)]
     table, more = split_reused(table, xy_m)
-    notes = [*given.notes, *check_speeds(path, table, xy_m, given.speed), *more]
-    require_motion(path, table, xy_m)
+    notes += [*more, *check_motion(path, table, xy_m, config.position_unit)]
     if raster is None:
         shape = _shape(path, given.unit, table, gsd_m)
     else:

@@ -7,7 +7,7 @@ import pandas as pd
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.errors import InputError
-from velfield.sources.tracks.formats import FOOT_M, MILE_PER_HOUR
+from velfield.sources.tracks.formats import FOOT_M, MILE_PER_HOUR, UNIT_M
 
 _SPAN_S = 0.5
 """Speeds are of positions at least so far apart in time, where the file has such."""
@@ -18,11 +18,15 @@ _MOVING_M_PER_S = 2.0
 _FASTEST_M_PER_S = 85.0
 """306 km/h: where a tenth of all moving rows are faster, a unit is wrong."""
 _JUMP_M, _JUMP_M_PER_S, _LONGEST_GAP_S = 15.0, 120.0, 300.0
+_USUAL_M_PER_S = (5.0, 150 / 3.6)
+"""Half of the vehicles of a place reach a speed in this range, 18 to 150 km/h, or one below it in queues."""
 _UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": MILE_PER_HOUR, "ft/s": FOOT_M}
 _STANDING_M_PER_S, _QUEUE_M, _LANE_M, _MOMENTS = 0.3, 60.0, 1.9, 300
 _GAPS_M = 3.5, 12.0
 """Least median, and largest tenth percentile, of the gaps of vehicles that queue."""
 _MOSTLY_SAME = 0.01
+_MOSTLY_BACK = 9
+"""A track's rows run back in time where so many times more steps do than run forth; of rows in no order half do."""
 _MIN_EXTENT_M = 6.0
 _FAR_M, _CRAWL_M_PER_S = 20.0, 0.55
 
@@ -49,8 +53,11 @@ def step_speeds(table: pd.DataFrame, xy: FloatArray) -> tuple[FloatArray, IntArr
     return moved / (time_s[rows[:, 1]] - time_s[rows[:, 0]]), rows
 
 
-def check_speeds(path: object, table: pd.DataFrame, xy_m: FloatArray, given: GivenSpeed | None) -> list[str]:
-    """Compare the speeds by the positions (m, 2), m, with those of the file and with what vehicles can do.
+def check_speeds(
+    path: object, table: pd.DataFrame, xy_m: FloatArray, given: GivenSpeed | None, unit: str | None
+) -> list[str]:
+    """Compare the speeds by the positions (m, 2), m, with those of the file and with what vehicles can do; ``unit``:
+    the one that the user gave for the positions.
 
     Raises
     ------
@@ -65,12 +72,22 @@ def check_speeds(path: object, table: pd.DataFrame, xy_m: FloatArray, given: Giv
         if known.sum() >= _MIN_ROWS and np.median(speed[known]) > 0:
             notes += _compare(path, float(np.median(speed[known] / stated[known])), speed[known], given)
     moving = speed[speed > _MOVING_M_PER_S]
-    if len(moving) and np.quantile(moving, 0.9) > _FASTEST_M_PER_S:
+    high = float(np.quantile(moving, 0.9)) if len(moving) else 0.0
+    if high > _FASTEST_M_PER_S:
         raise InputError(
-            f"{path}: found vehicles at {3.6 * np.quantile(moving, 0.9):.0f} km/h by their positions and times; check "
-            "the units of positions (--unit, --gsd-m) and of times (--fps)"
+            f"{path}: found vehicles at {3.6 * high:.0f} km/h by their positions and times, expected at most "
+            f"{3.6 * _FASTEST_M_PER_S:.0f}; {_other_units(unit, high)}"
         )
     return notes
+
+
+def _other_units(unit: str | None, speed_m_per_s: float) -> str:
+    """What to do about vehicles that are too fast: the units of positions in which they are not."""
+    low, high = _USUAL_M_PER_S
+    made = {other: speed_m_per_s * factor / UNIT_M[unit] for other, factor in UNIT_M.items()} if unit in UNIT_M else {}
+    fits = [f"--unit {other} makes it {3.6 * v:.0f} km/h" for other, v in made.items() if low <= v <= high]
+    otherwise = "check the unit of positions (--unit, --gsd-m) and the times (--fps)"
+    return f"{', '.join(fits)}; else {otherwise}" if fits else otherwise
 
 
 def _compare(path: object, ratio: float, speed: FloatArray, given: GivenSpeed) -> list[str]:
@@ -125,6 +142,24 @@ def check_standing_gaps(table: pd.DataFrame, xy_m: FloatArray) -> list[str]:
     ]
 
 
+def check_order(table: pd.DataFrame) -> list[str]:
+    """A warning where the rows of most tracks, in the order of the file, run back in time: the times may count down, as
+    of a clip that is read from its end, and the vehicles would drive backwards. The table has ``track_id, time_s``."""
+    order = np.argsort(table["track_id"].to_numpy(np.int64), kind="stable")
+    track, time_s = table["track_id"].to_numpy(np.int64)[order], table["time_s"].to_numpy(np.float64)[order]
+    same = np.diff(track) == 0
+    forth, back = (np.bincount(track[1:][same & (sense * np.diff(time_s) > 0)], minlength=1) for sense in (1, -1))
+    n = max(len(forth), len(back))
+    forth, back = (np.pad(counts, (0, n - len(counts))) for counts in (forth, back))
+    moves, falls = int(((forth + back) > 0).sum()), int((back > _MOSTLY_BACK * forth).sum())
+    if falls <= moves / 2:
+        return []
+    return [
+        f"warning: the rows of {falls} of {moves} tracks are in descending order of time, expected ascending: if the "
+        "times count down, all vehicles drive backwards here, and their origins are their destinations"
+    ]
+
+
 def drop_repeated(path: object, table: pd.DataFrame, columns: list[str]) -> tuple[pd.DataFrame, list[str]]:
     """A table with one position of each track at a time, and a note on rows that were dropped.
 
@@ -160,8 +195,10 @@ def split_reused(table: pd.DataFrame, xy_m: FloatArray) -> tuple[pd.DataFrame, l
     return table.assign(track_id=part), [named]
 
 
-def require_motion(path: object, table: pd.DataFrame, xy_m: FloatArray) -> None:
-    """Refuse tracks of which none goes anywhere, or all crawl.
+def check_motion(path: object, table: pd.DataFrame, xy_m: FloatArray, unit: str | None) -> list[str]:
+    """Refuse tracks of which none goes anywhere, or all crawl; a warning where most are faster than on any road.
+
+    ``unit`` is the one that the user gave for the positions.
 
     Raises
     ------
@@ -185,6 +222,13 @@ def require_motion(path: object, table: pd.DataFrame, xy_m: FloatArray) -> None:
             f"{path}: found vehicles that drive {_FAR_M:g} m and more at {3.6 * np.median(fastest):.2g} km/h at most "
             "by their positions and times; check that times are in seconds (time_s; time_ms for milliseconds, or --fps)"
         )
+    typical = float(np.median(fastest)) if len(fastest) >= _MIN_ROWS else 0.0
+    if typical <= _USUAL_M_PER_S[1]:
+        return []
+    return [
+        f"warning: half of the vehicles reach {3.6 * typical:.0f} km/h or more by their positions and times, expected "
+        f"at most {3.6 * _USUAL_M_PER_S[1]:.0f} on roads; {_other_units(unit, typical)}"
+    ]
 
 
 def mirrored_and_scale(xy_up: FloatArray, east_north: FloatArray) -> tuple[bool, float] | None:

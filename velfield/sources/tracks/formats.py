@@ -8,10 +8,12 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Literal
 
-Unit = Literal["m", "ft", "px", "deg"]
+Unit = Literal["m", "ft", "cm", "mm", "px", "deg"]
 YAxis = Literal["up", "down"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 FOOT_M, MILE_PER_HOUR = 0.3048, 0.44704
+UNIT_M: dict[str, float] = {"m": 1.0, "ft": FOOT_M, "cm": 0.01, "mm": 0.001}
+"""Metres of the units of length."""
 
 
 @dataclass(frozen=True)

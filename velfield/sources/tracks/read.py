@@ -13,10 +13,9 @@ from rasterio.warp import transform
 from schemas.arrays import FloatArray
 from velfield.errors import InputError
 from velfield.sources.geo import utm_crs
-from velfield.sources.tracks.checks import GivenSpeed, drop_repeated, mirrored_and_scale
+from velfield.sources.tracks.checks import GivenSpeed, check_order, drop_repeated, mirrored_and_scale
 from velfield.sources.tracks.files import numbers, read_columns
 from velfield.sources.tracks.formats import (
-    FOOT_M,
     FRAMES,
     PLACES,
     POSITIONS,
@@ -25,6 +24,7 @@ from velfield.sources.tracks.formats import (
     SPEEDS,
     TIMES,
     TRACKS,
+    UNIT_M,
     Position,
     Speed,
     TrackFormat,
@@ -124,7 +124,7 @@ class _Reader:
             xy[:, 1] *= -1
         elif axis == "up":
             xy[:, 1] *= -1
-        if unit in ("m", "ft"):
+        if unit in UNIT_M:
             axis, xy, more = self._against_degrees(position, axis, xy)
             notes += more
         key, more = self._key(time_s, xy)
@@ -135,6 +135,7 @@ class _Reader:
         notes += more
         table = table.assign(**sizes)
         speed = self._speed()
+        notes += check_order(table)
         table["row"] = np.arange(len(table))
         table, more = drop_repeated(self.path, table, ["x", "y"])
         table = table.sort_values(["track_id", "time_s"], kind="stable", ignore_index=True)
@@ -179,7 +180,7 @@ class _Reader:
         if unit is None:
             raise InputError(
                 f"{self.path}: found columns {self.columns[position.x]} and {self.columns[position.y]} without a unit; "
-                "give --unit m, ft, px or deg"
+                "give --unit m, ft, cm, mm, px or deg"
             )
         return unit
 
@@ -206,8 +207,7 @@ class _Reader:
 
     def _to_units(self, x: FloatArray, y: FloatArray, unit: Unit) -> FloatArray:
         xy = np.column_stack([x, y])
-        if unit == "ft":
-            xy *= FOOT_M
+        xy *= UNIT_M.get(unit, 1.0)
         if self.form is not None and self.form.point == "corner" and self.form.size is not None:
             width, height = (numbers(self.raw[self.columns[name]], self.path) for name in self.form.size[:2])
             xy += np.column_stack([width, height]) / 2
@@ -348,7 +348,11 @@ class _Reader:
             span = f"{_SIZES_M[0]:g} to {_SIZES_M[1]:g} m"
             return {}, [f"{self.columns[found[0]]} holds no length of {span}: it is left out"]
         if len(known) and self.form is None and float(np.median(known)) > 9.0 and found[0] != "lengthm":
-            return {}, [f"{self.columns[found[0]]} is {np.median(known):.3g} for most: in feet? It is left out"]
+            name = self.columns[found[0]]
+            return {}, [
+                f"{name} is {np.median(known):.3g} for most: in feet? It is left out; if the positions are in feet, "
+                "too, give --unit ft"
+            ]
         return sizes, []
 
     def _speed(self) -> GivenSpeed | None:
