@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_traffic_analysis import CYCLE_S, EAST, SOUTH, Track, crossroads, drive, gather
+from velfield.analysis.answers import find_answers
 from velfield.analysis.signals.cycles import JunctionSignal
 from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -74,3 +75,45 @@ def test_a_cycle_of_starts_that_wait_for_the_junction_to_clear_holds_the_truth()
     assert np.mean(held) > 0.86
     assert np.mean(green) > 0.86
     assert np.median(half_s) < 1.6
+
+
+def two_lanes(inner_go_s: list[float]) -> list[Track]:
+    """Twelve cycles: two lanes from the west, of which the first of the inner one drives off at given times of the
+    cycles, one after the other; to the south green from 20 s on."""
+    inner = EAST - np.array([0.0, 3.5])
+    out = []
+    for cycle in range(12):
+        begin = cycle * CYCLE_S
+        for k in range(3):
+            go, inner_go = begin + START_DELAY_S + 1.8 * k, inner_go_s[cycle % len(inner_go_s)]
+            out.append(drive(EAST, begin - 20 + 3 * k, stop_at_m=STOP_M - 7 * k, go_s=go))
+            out.append(drive(inner, begin - 18.5 + 3 * k, stop_at_m=STOP_M - 7 * k, go_s=go + inner_go))
+            out.append(drive(SOUTH, begin - 4 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=go + 20))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("inner_go_s", "phases"),
+    [([0.0, 10.0, 10.0], 2), ([3.0, 10.0, 10.0, 6.0], 2), ([10.0], 3)],
+    ids=["first at green, or in a gap", "in gaps alone", "a green of its own"],
+)
+def test_a_lane_has_a_green_of_its_own_where_it_has_red_before(inner_go_s: list[float], phases: int) -> None:
+    signal = signal_of(two_lanes(inner_go_s))
+    assert len(signal.phases) == phases
+    for stream in signal.streams:
+        path = stream.stream.approach.path_m
+        inner = path[0, 1] < 98.0
+        true = 20.0 if np.ptp(path[:, 0]) < 2.0 else 10.0 if phases == 3 and inner else 0.0
+        green = stream.green_phase_s
+        off = (true - green.value + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
+        assert green.low - green.value < off < green.high - green.value
+
+
+def test_a_lane_whose_green_is_not_known_is_named() -> None:
+    """Two vehicles start on the inner lane, 10 s after those beside them: they may have waited for a gap."""
+    tracks = [track for k, track in enumerate(two_lanes([10.0])) if k % 3 != 1 or k in (37, 64)]
+    tracks += [drive(EAST - np.array([0.0, 3.5]), cycle * CYCLE_S + 12.0) for cycle in range(12)]
+    analysis = TrafficAnalysis(gather(tracks))
+    (said,) = (a.text for a in find_answers(analysis) if a.topic == "signal" and a.state == "found")
+    assert "2 phases" in said
+    assert "; from W, straight on (lane 2): green not known" in said

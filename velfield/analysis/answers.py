@@ -230,6 +230,10 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
         later_s = (begins_s - first_s) % cycle.value
         after = f", beginning {later_s:.0f} s after the first green" if later_s else ""
         text += f"; {_from_arms(analysis, signal.junction, lanes)}green{long}{after}"
+    known = {lane for lanes in signal.phases for lane in lanes}
+    stop = (s.approach.lane for s in analysis.streams[signal.junction] if s.stop_line_m is not None)
+    if unknown := sorted({*stop} - known):
+        text += f"; {_from_arms(analysis, signal.junction, unknown)}green not known: too few are seen to start with it"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 

@@ -11,6 +11,7 @@ from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
 from velfield.analysis.signals.phases import fit_phases, start_together
 from velfield.analysis.signals.queues import REACH_M, Stream
+from velfield.analysis.signals.shared_greens import lanes_by_phase
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
 MIN_CYCLE_S, MAX_CYCLE_S = 24.0, 200.0
@@ -123,12 +124,14 @@ def find_signal(
     if found is None:
         reason = f"too little data: {duration:.0f} s, two cycles of {MIN_CYCLE_S:.0f} s or more needed"
         return JunctionSignal(junction, None, reason, None, (), ())
-    cycle, concentration, p_value = found
+    cycle, p_value = found
     if cycle > duration / 2:
         reason = (
             f"too little data: starts of queues may recur every {cycle:.0f} s, of which {duration:.0f} s hold no two"
         )
         return JunctionSignal(junction, None, reason, None, (), ())
+    events = [_first_after_red(times, cycle) for times in events]
+    concentration = float(_concentration(np.array([1 / cycle]), events)[0])
     if p_value > _MAX_P_VALUE or concentration < _MIN_CONCENTRATION:
         if n >= _NO_CYCLE_STARTS and duration >= _NO_CYCLE_S:
             reason = f"no fixed cycle: {n} starts of queues, concentration {concentration:.2f}"
@@ -138,7 +141,8 @@ def find_signal(
             f"({stopped} of {share.n if share else 0} vehicles stopped)"
         )
         return JunctionSignal(junction, None, reason, None, (), ())
-    estimate, phases = fit_phases(events, cycle, time_sd_s=max(stream.stop_time_sd_s for stream in used))
+    estimate, by_start = fit_phases(events, cycle, time_sd_s=max(stream.stop_time_sd_s for stream in used))
+    phases = lanes_by_phase(used, events, by_start, estimate.value)
     greens = {used[k].approach.lane: phase.green_s for phase in phases for k in phase.streams}
     late = _late_s([_after_green(found, greens) for found in by_time], main, estimate.value)
     seen_late = [(seen, by) for seen, by in zip(observed_s, late, strict=True) if by is not None]
@@ -170,12 +174,24 @@ def _at_stop_lines(streams: Sequence[Stream], observed_s: FloatArray) -> list[St
         found = max(_starts_by_time(lines, observed_s), key=lambda one: sum(len(times) for _, times in one))
         events, duration = [times for _, times in found], float(np.diff(observed_s).max())
         fit = _fit_period(events, min(MAX_CYCLE_S, duration)) if events and duration > 2 * MIN_CYCLE_S else None
-        # so many starts recur
-        if fit is not None and fit[1] >= _MIN_CONCENTRATION and fit[1] * sum(map(len, events)) > best:
-            cycle_s, best = fit[0], fit[1] * sum(map(len, events))
+        if fit is None:
+            continue
+        events = [_first_after_red(times, fit[0]) for times in events]
+        concentration = float(_concentration(np.array([1 / fit[0]]), events)[0])
+        recur = concentration * sum(map(len, events))  # so many starts do
+        if concentration >= _MIN_CONCENTRATION and recur > best:
+            cycle_s, best = fit[0], recur
     if not best:
         return list(streams)
     return [upstream if _waits_beyond(stream, upstream, cycle_s) else stream for stream, upstream in every]
+
+
+def _first_after_red(times_s: FloatArray, cycle_s: float) -> FloatArray:
+    """The first start of a stream in each cycle: others wait for a gap. Red ends the longest part without starts."""
+    phase = np.sort(times_s % cycle_s)
+    red_ends = phase[np.argmax(np.diff(phase, prepend=phase[-1] - cycle_s))] if len(phase) else 0.0
+    _, first = np.unique(np.floor((times_s - red_ends) / cycle_s + 1e-9), return_index=True)
+    return times_s[first]
 
 
 def _waits_beyond(stream: Stream, upstream: Stream, cycle_s: float) -> bool:
@@ -231,17 +247,17 @@ def _stopping(streams: Sequence[Stream]) -> tuple[int, Estimate | None]:
     return len(stopped), estimate_share(float(len(stopped)), len(every))
 
 
-def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, float, float] | None:
-    """The period at which the starts of each stream recur: s, concentration, and probability by chance."""
+def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, float] | None:
+    """The period at which the starts of each stream recur, s, and the probability that they do by chance."""
     found = _fit_period(events, longest_s)
     if found is None:
         return None
     cycle_s, concentration, frequency = found
     n = sum(len(times) for times in events)
     if n <= _DRAWN_STARTS:
-        return cycle_s, concentration, _chance(events, frequency, concentration)
+        return cycle_s, _chance(events, frequency, concentration)
     excess = max(n * concentration - 1.0 * len(events), 0.0) ** 2 / n
-    return cycle_s, concentration, float(min(len(frequency) / 5 * np.exp(-excess), 1.0))
+    return cycle_s, float(min(len(frequency) / 5 * np.exp(-excess), 1.0))
 
 
 def _fit_period(events: Sequence[FloatArray], longest_s: float) -> tuple[float, float, FloatArray] | None:
