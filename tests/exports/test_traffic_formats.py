@@ -22,7 +22,7 @@ from velfield.exports.export import export_run
 from velfield.exports.junctions.signal_events import event_archive
 from velfield.exports.junctions.turning_counts import junction_rows, peak_hour_factor, turning_workbook
 from velfield.exports.junctions.utdf import utdf
-from velfield.exports.roads import ssam
+from velfield.exports.tracks import ssam
 
 __all__ = ["analysis"]
 
