@@ -152,10 +152,18 @@ def run(
         print(_describe_plan(job, where, of_tracks=tracks is not None))
         return DONE
     status = process(job, runner=where, verbosity=verbosity, of_tracks=tracks is not None)
-    if status in (DONE, INCOMPLETE) and tracks is None:
+    if status in (DONE, INCOMPLETE) and tracks is None and _has_tracks(out):
         root = shlex.quote(absolute(str(out)))
         print(f"answers {own_command()} analyse {root}   (turning counts, queues, signals, speeds)")
     return status
+
+
+def _has_tracks(out: Path) -> bool:
+    """Whether a run found any track to analyse."""
+    from velfield.run.commits import read_commits
+    from velfield.run.layout import RunLayout, to_path
+
+    return any(commit.counts.get("tracks", 0.0) > 0 for commit in read_commits(RunLayout(to_path(out)), "tracks"))
 
 
 def _check_tracks(tracks: Path | None, frames_only: list[str]) -> None:

@@ -8,10 +8,18 @@ import pytest
 
 from schemas.arrays import FloatArray
 from velfield.analysis.answers import find_answers
+from velfield.analysis.approaches import lanes_text
 from velfield.analysis.changes import find_changes
 from velfield.analysis.flow.conflicts import find_conflicts, persistent, positions_on_lanes
+from velfield.analysis.flow.speeds import FreeFlow
 from velfield.analysis.flow.volume import flow_slices
-from velfield.analysis.intervals import estimate_censored_quantile, estimate_quantile, estimate_rate, estimate_share
+from velfield.analysis.intervals import (
+    Estimate,
+    estimate_censored_quantile,
+    estimate_quantile,
+    estimate_rate,
+    estimate_share,
+)
 from velfield.analysis.movements.gates import Arm, Gate, Gates
 from velfield.analysis.movements.movements import furness
 from velfield.analysis.movements.reversals import Reversal, seen_whole_s
@@ -345,6 +353,27 @@ def test_who_leaves_a_roundabout_by_the_arm_of_entry_makes_a_u_turn() -> None:
     assert [turn.left for turn in analysis.reversals] == [False] * 3  # y down: the circle is driven to the right
     (answer,) = (a for a in find_answers(analysis) if a.topic == "u-turns")
     assert re.fullmatch(r"3 seen, 3\d an hour \(\d+ to \d+\): 3 at junction 0", answer.text)
+    (answer,) = (a for a in find_answers(analysis) if a.topic == "queue")
+    assert answer.text == "too little data: queues are measured before a signal whose cycle is known"
+    ring = {
+        lanes_text(road.lanes)
+        for road in analysis.free_flow
+        if road.lanes[0] in analysis.lanes.junctions[0].lanes_inside
+    }
+    told = {a.subject: "limit" in a.text for a in find_answers(analysis) if a.topic == "speed" and a.estimate}
+    assert {told[subject] for subject in ring & set(told)} == {False}
+    assert {told[subject] for subject in set(told) - ring} == {True}
+
+
+def test_of_three_speed_limits_none_is_named(analysis: TrafficAnalysis) -> None:
+    found = TrafficAnalysis(analysis.trajectories)
+    free = [Estimate(14.0, low, 15.6, 12) for low in (12.0, 13.5)]
+    found.__dict__["free_flow"] = [FreeFlow((k,), one, None) for k, one in enumerate(free)]
+    said = [a.text for a in find_answers(found) if a.topic == "speed" and a.estimate]
+    assert [text.split(", n 12)")[1] for text in said] == [
+        "; the limit is not known",
+        ", as under a limit of 50 or 60 km/h",
+    ]
 
 
 def test_u_turns_that_the_ends_of_short_clips_cut_do_not_bias_their_rate() -> None:

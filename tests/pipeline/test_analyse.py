@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from flows.commands.analyse import analyse
+from flows.commands.run import _has_tracks
 from schemas.analysis import AnalysisRecord, LanesRecord
 from schemas.records import CommitRecord
 from tests.analysis.test_traffic_analysis import crossroads
@@ -17,6 +18,7 @@ from velfield.errors import InputError
 from velfield.pipeline.given_tracks.load import MARGIN_M
 from velfield.run.commits import sealed_json, write_atomically, write_commit
 from velfield.run.flight_record import read_flight_record
+from velfield.run.layout import RunLayout
 
 
 @pytest.fixture(scope="module")
@@ -166,6 +168,13 @@ def test_that_the_size_of_a_pixel_is_not_known_is_said(
     assert ("the paper's 0.23 m a pixel" in capsys.readouterr().out) is (gsd_m is None)
     report = (tmp_path / "run" / "analysis" / "report.html").read_text()
     assert ("those of 0.23 m" in report) is (gsd_m is None)
+
+
+@pytest.mark.parametrize("tracks", [0.0, 7.0])
+def test_a_run_without_tracks_does_not_offer_answers(tmp_path: Path, tracks: float) -> None:
+    layout = RunLayout(tmp_path)
+    write_commit(layout, CommitRecord(stage="tracks", unit="all", key="k", code_version="1", counts={"tracks": tracks}))
+    assert _has_tracks(tmp_path) is (tracks > 0)
 
 
 def test_tracks_older_than_the_settings_are_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from velfield.pipeline.analysis.tables import all_tables, flow_table, limit_tabl
 from velfield.report.drawing import new_figure, pages_bytes
 from velfield.report.traffic.diagrams import draw_delays, draw_queues, draw_time_space, red_times, traffic_diagrams
 from velfield.report.traffic.first_page import FirstPage, first_page
+from velfield.report.traffic.place import place_labels
 from velfield.report.traffic.report import report_html
 
 __all__ = ["analysis"]
@@ -96,6 +97,12 @@ def test_a_turn_that_two_of_many_take_is_rare_and_no_danger(analysis: TrafficAna
     assert answer.state == "none"
     (answer,) = (a for a in find_answers(analysis) if a.topic == "conflicts")
     assert answer.text.startswith("none in 8.5 min on ways that three vehicles or more drive, so fewer than ")
+
+
+def test_the_map_numbers_the_lanes_that_answers_name_first(analysis: TrafficAnalysis) -> None:
+    named = {str(lane) for found in analysis.movements for lane in found.gates.arms_in}
+    numbers = [label.text for label in place_labels(analysis, None).numbers]
+    assert set(numbers[: len(named)]) == named
 
 
 def test_rows_and_columns_without_a_number_are_one_line_of_the_report() -> None:

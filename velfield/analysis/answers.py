@@ -1,5 +1,6 @@
 """Answers for people: a number with its interval, none and at most so many an hour, or what is missing for one."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -18,6 +19,7 @@ from velfield.analysis.approaches import (
     lanes_without_queue,
     longest_queues,
 )
+from velfield.analysis.flow.speeds import FreeFlow
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.movements.movements import MIN_DELAY_S, MIN_DELAYED, JunctionMovements
@@ -32,7 +34,8 @@ State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
 _AT_JUNCTION_M, _ON_LANE_M, _ROAD_M = 20.0, 10.0, 50.0
-_NAMED = 3
+_NAMED, _SIGNS = 3, 2
+"""Unusual tracks that a line names; of more speed limits than two the line names none."""
 COVERED = "on ways that three vehicles or more drive"
 """Where conflicts are looked for."""
 TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
@@ -162,7 +165,10 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
         if not r.seen:
             continue  # the table has what is inferred alone
         share = _share_text(r.share, r.origin.name)
-        text = f"{count_text(r.vehicles, 'vehicle')}, {r.seen} of them tracked all the way{share}"
+        text = (
+            f"{count_text(r.vehicles, 'vehicle')} from edge to edge of the view, {r.seen} of them tracked all the way"
+        )
+        text += share
         yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
 
 
@@ -193,10 +199,10 @@ def _share_text(share: Estimate | None, origin: str) -> str:
 def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
     known = [(road, road.speed_m_per_s) for road in analysis.free_flow if road.speed_m_per_s]
     for road, speed in sorted(known, key=lambda pair: -pair[1].n):
-        factor, signs = PER_M_PER_S[unit], " or ".join(f"{sign:.0f}" for sign in road.limits(unit))
-        text = f"free flow {estimate_text(speed, unit, factor)}" + (
-            f", as under a limit of {signs} {unit}" if signs else ""
-        )
+        factor, signs = PER_M_PER_S[unit], [f"{sign:.0f}" for sign in speed_limits(analysis, road, unit)]
+        text = f"free flow {estimate_text(speed, unit, factor)}"
+        text += f", as under a limit of {' or '.join(signs)} {unit}" if 0 < len(signs) <= _SIGNS else ""
+        text += "; the limit is not known" if len(signs) > _SIGNS else ""
         yield Answer("speed", lanes_text(road.lanes), "found", text, speed.in_units(factor), unit)
     if not known:
         text = "too little data: no free-flow speed, as no road has 8 vehicles that go freely and steadily"
@@ -213,11 +219,17 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
         yield Answer("mean speed", f"lane {lane}", "found", text, mean.in_units(PER_M_PER_S[unit]), unit)
 
 
+def speed_limits(analysis: TrafficAnalysis, road: FreeFlow, unit: SpeedUnit) -> list[float]:
+    """`FreeFlow.limits` of a road; none within a roundabout, where the bend limits the speed."""
+    rings = [set(junction.lanes_inside) for junction in analysis.lanes.junctions if junction.kind == "roundabout"]
+    return [] if any(ring.issuperset(road.lanes) for ring in rings) else road.limits(unit)
+
+
 def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     subject = f"junction {signal.junction}"
     if not signal.signalised or signal.cycle_s is None:
         state: State = "too little data" if signal.signalised is None else "none"
-        return Answer("signal", subject, state, signal.reason)
+        return Answer("signal", subject, state, no_cycle_text(signal))
     cycle = signal.cycle_s
     text = f"cycle {cycle.value:.1f} s ({cycle.low:.1f} to {cycle.high:.1f}), {count_text(len(signal.phases), 'phase')}"
     first_s = None
@@ -235,6 +247,23 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     if unknown := sorted({*stop} - known):
         text += f"; {_from_arms(analysis, signal.junction, unknown)}green not known: too few are seen to start with it"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
+
+
+def no_cycle_text(signal: JunctionSignal) -> str:
+    """Why no cycle of a junction is known, for people.
+
+    Examples
+    --------
+    >>> no_cycle_text(JunctionSignal(0, False, "no fixed cycle: 50 starts of queues, concentration 0.28", None, (), ()))
+    'no signal was found: vehicles start at any time, 50 queues in no fixed cycle (an actuated signal has none either)'
+    """
+    starts = re.fullmatch(r"no fixed cycle: (\d+) starts of queues.*", signal.reason)
+    if starts is None:
+        return signal.reason
+    return (
+        f"no signal was found: vehicles start at any time, {starts[1]} queues in no fixed cycle (an actuated signal "
+        "has none either)"
+    )
 
 
 def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:
@@ -263,6 +292,10 @@ def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Ans
 
 def _queues(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:
     """The longest queue of each arm; the lanes whose queue is not known."""
+    number = found.junction.number
+    if analysis.ways_meet(number) and number not in analysis.lane_queues:
+        text = "too little data: queues are measured before a signal whose cycle is known"
+        yield Answer("queue", f"junction {number}", "too little data", text)
     for arm, longest in longest_queues(analysis, found).items():
         text = f"longest, {lane_text(found, longest.lane)}: {longest.text}"
         subject = f"junction {found.junction.number} from {arm}"

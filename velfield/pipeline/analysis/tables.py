@@ -7,7 +7,7 @@ import numpy as np
 from schemas.analysis import AnalysisTable
 from schemas.arrays import FloatArray
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import TWO_LEVELS
+from velfield.analysis.answers import TWO_LEVELS, no_cycle_text, speed_limits
 from velfield.analysis.approaches import ApproachDelay, ArmQueue, approach_delays, longest_queues
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
@@ -195,9 +195,13 @@ def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
 def limit_table(analysis: TrafficAnalysis, unit: SpeedUnit = "km/h") -> AnalysisTable:
     """Speed limits, of signs in a unit."""
+
+    def only(limits: list[float]) -> float | None:
+        return limits[0] if len(limits) == 1 else None
+
     columns: list[Column[FreeFlow]] = [
         Column("lanes", "Lanes", "", lambda road: _numbers(road.lanes)),
-        Column("limit", "Limit, inferred", unit, lambda road: road.limit(unit)),
+        Column("limit", "Limit, inferred", unit, lambda road: only(speed_limits(analysis, road, unit))),
         estimates("free_speed", "Free-flow speed", "km/h", lambda road: road.speed_m_per_s, KM_PER_H),
         estimates("p85", "Free-flow speed p85", "km/h", lambda road: road.p85_m_per_s, KM_PER_H),
     ]
@@ -237,7 +241,7 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     def said(signal: JunctionSignal) -> str:
         if analysis.junction_kind(signal.junction) == "crossing":
             return TWO_LEVELS
-        reason = signal.reason.removeprefix("too little data: ").removeprefix("no signal: ")
+        reason = no_cycle_text(signal).removeprefix("too little data: ").removeprefix("no signal: ")
         return names[signal.signalised] + (f": {reason}" if reason else "")
 
     columns: list[Column[JunctionSignal]] = [

@@ -162,14 +162,20 @@ def place_labels(analysis: TrafficAnalysis, picture: GreyImage | None) -> MapLab
 
 
 def _numbers(analysis: TrafficAnalysis, boxes: _Boxes) -> list[Label]:
-    """Numbers of lanes where there is room for them, before a lane's first junction where that can be."""
+    """Numbers of lanes where there is room for them, before a lane's first junction where that can be; first of those
+    into junctions where ways meet, which the answers on signals and queues name."""
     reach_m = {lane.number: lane.length_m for lane in analysis.lanes}
+    named = {
+        k for found in analysis.movements if analysis.ways_meet(found.junction.number) for k in found.gates.arms_in
+    }
     for gate in (gate for found in analysis.movements for gate in found.gates.gates if gate.inwards):
         lane = analysis.lanes.lanes[gate.lane]
         at_m = float(lane.along_m[np.argmin(np.hypot(*(lane.xy_m - gate.xy_m).T))])
         reach_m[gate.lane] = min(reach_m[gate.lane], max(at_m, _LONG_M))
     out = []
-    for lane in sorted(analysis.lanes, key=lambda lane: (lane.length_m < _LONG_M, lane.length_m)):
+    for lane in sorted(
+        analysis.lanes, key=lambda lane: (lane.number not in named, lane.length_m < _LONG_M, lane.length_m)
+    ):
         reach = reach_m[lane.number]
         further = np.arange(0, lane.length_m, 2 * _STEP_PT * boxes.m_per_pt)
         places = lane.at(np.r_[np.array(_NUMBER_AT) * reach, further[further < reach], further])
