@@ -18,17 +18,17 @@ def signal_of(tracks: list[Track]) -> JunctionSignal:
     return signal
 
 
-def giving_way() -> list[Track]:
-    """Twelve cycles, as `crossroads`; in three of four the second from the west waits in the junction until 16 s of
-    the cycle, and those behind it wait too."""
+def giving_way(*, vehicles: int = 4, leave_s: float = 14.2, south_s: float = 20.0) -> list[Track]:
+    """Twelve cycles, as `crossroads`; in three of four the second from the west waits in the junction, and those behind
+    it wait too. To the south the first drive off after ``south_s``."""
     out = []
     for cycle in range(12):
         begin = cycle * CYCLE_S
-        for k in range(4):
+        for k in range(vehicles):
             go = begin + START_DELAY_S + 1.8 * k
-            waits = (GAP_M - 7.0 * (k - 1), begin + 14.2 + 1.8 * k) if cycle % 4 and k else None
+            waits = (GAP_M - 7.0 * (k - 1), begin + leave_s + 1.8 * k) if cycle % 4 and k else None
             out.append(drive(EAST, begin - 24 + 3 * k, stop_at_m=STOP_M - 7 * k, go_s=go, waits=waits))
-            out.append(drive(SOUTH, begin - 4 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=go + 20))
+            out.append(drive(SOUTH, begin - 4 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=go + south_s))
     return out
 
 
@@ -40,6 +40,14 @@ def test_the_stop_line_is_not_where_vehicles_wait_for_a_gap() -> None:
     assert stop[0] == pytest.approx(STOP_M + 2.4, abs=1.5)  # the front of a car
     early_s = (west.green_phase_s.value + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
     assert early_s == pytest.approx(0.0, abs=1.0)
+
+
+def test_who_stands_at_the_line_behind_one_that_is_not_seen_has_no_green_of_its_own() -> None:
+    """In two cycles a vehicle stands there until 18 s of the cycle: one that waits in the junction is missed."""
+    late = [drive(EAST, k * CYCLE_S + 2.0, stop_at_m=STOP_M + 0.5, go_s=k * CYCLE_S + 18.0) for k in (4, 8)]
+    west = next(s for s in signal_of(giving_way() + late).streams if np.ptp(s.stream.approach.path_m[:, 1]) < 2.0)
+    stop = west.stream.approach.path_m[round(west.stream.stop_line_m or 0)]
+    assert stop[0] == pytest.approx(STOP_M + 2.4, abs=1.5)
 
 
 def test_where_the_first_is_not_seen_the_second_does_not_stand_at_the_line() -> None:
@@ -75,6 +83,13 @@ def test_a_cycle_of_starts_that_wait_for_the_junction_to_clear_holds_the_truth()
     assert np.mean(held) > 0.86
     assert np.mean(green) > 0.86
     assert np.median(half_s) < 1.6
+
+
+def test_a_green_may_begin_before_the_junction_is_clear() -> None:
+    """To the south green begins at 20 s. The first start after 23 s, behind the last that wait in the junction."""
+    tracks = [track for k, track in enumerate(giving_way(vehicles=3, leave_s=17.0, south_s=23.0)) if k // 6 % 4]
+    south = next(s for s in signal_of(tracks).streams if np.ptp(s.stream.approach.path_m[:, 0]) < 2.0)
+    assert south.green_phase_s.low < 20.0 < 22.0 < south.green_phase_s.value
 
 
 def two_lanes(inner_go_s: list[float]) -> list[Track]:

@@ -9,7 +9,7 @@ from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
-from velfield.analysis.signals.phases import fit_phases, start_together
+from velfield.analysis.signals.phases import START_DELAY_S, Phase, fit_phases, start_together
 from velfield.analysis.signals.queues import REACH_M, Stream
 from velfield.analysis.signals.shared_greens import lanes_by_phase
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
@@ -28,6 +28,9 @@ at green."""
 _DRAWN_STARTS, _DRAWS = 40, 2000
 """Maximum number of starts for which the probability of recurring by chance is simulated, and number of simulations."""
 _QUEUE_GAP_S = 8.0
+_CLEARS_S, _CLEARS_SHARE = 5.0, 0.9
+"""Where so large a share of the starts follows so soon on vehicles that waited within the junction, none is known to be
+prompt."""
 _MAX_P_VALUE = 0.005
 """Probability by chance above which starts do not recur."""
 _MIN_CONCENTRATION = 0.85
@@ -99,7 +102,7 @@ def find_signal(
     The cycle is that of the time with most starts of queues: over a gap, as between clips, its error would grow to a
     cycle. In the other times the signal is late by what their own starts show.
     """
-    streams = _at_stop_lines(streams, observed_s)
+    foremost, streams = streams, _at_stop_lines(streams, observed_s)
     by_time = _starts_by_time(streams, observed_s)
     counts = [sum(len(times) for _, times in found) for found in by_time]
     main = int(np.argmax(counts)) if counts else 0
@@ -142,6 +145,8 @@ def find_signal(
         )
         return JunctionSignal(junction, None, reason, None, (), ())
     estimate, by_start = fit_phases(events, cycle, time_sd_s=max(stream.stop_time_sd_s for stream in used))
+    waits = [one for one, line in zip(foremost, streams, strict=True) if one is not line]
+    by_start = tuple(_not_before_clear(phase, used, events, waits) for phase in by_start)
     phases = lanes_by_phase(used, events, by_start, estimate.value)
     greens = {used[k].approach.lane: phase.green_s for phase in phases for k in phase.streams}
     late = _late_s([_after_green(found, greens) for found in by_time], main, estimate.value)
@@ -149,6 +154,36 @@ def find_signal(
     signals = [_stream_signal(used[k], phase.green_s, estimate, seen_late) for phase in phases for k in phase.streams]
     lanes = tuple(tuple(sorted(used[k].approach.lane for k in phase.streams)) for phase in phases)
     return JunctionSignal(junction, True, "", estimate, _with_hidden_share(signals), lanes)
+
+
+def _not_before_clear(
+    phase: Phase, streams: Sequence[Stream], starts_s: Sequence[FloatArray], waits: Sequence[Stream]
+) -> Phase:
+    """A phase whose green may have begun earlier, if vehicles of other lanes leave the junction before all its starts:
+    it begins behind the last of the others that crosses a stop line.
+
+    Parameters
+    ----------
+    waits
+        Lanes whose vehicles wait within the junction, by the place where they do.
+    """
+    lanes = {streams[k].approach.lane for k in phase.streams}
+    starts = np.sort(np.concatenate([starts_s[k] for k in phase.streams]))
+    leave, cross = (
+        np.sort(np.concatenate([np.empty(0), *(s.cross_time_s for s in of if s.approach.lane not in lanes)]))
+        for of in (waits, streams)
+    )
+    clears = _since(starts, leave) < _CLEARS_S
+    if np.mean(clears) < _CLEARS_SHARE:
+        return phase
+    green = phase.green_s
+    low = green.value + START_DELAY_S - float(np.median(_since(starts, cross)[clears]))
+    return replace(phase, green_s=replace(green, low=min(green.low, low)))
+
+
+def _since(times_s: FloatArray, before_s: FloatArray) -> FloatArray:
+    """How long before each time (n,) the last of others (m,), both sorted, was; infinite where none was."""
+    return np.asarray(times_s - np.r_[-np.inf, before_s][np.searchsorted(before_s, times_s)])
 
 
 def _starts_by_time(streams: Sequence[Stream], observed_s: FloatArray) -> list[list[tuple[Stream, FloatArray]]]:
@@ -196,7 +231,7 @@ def _first_after_red(times_s: FloatArray, cycle_s: float) -> FloatArray:
 
 def _waits_beyond(stream: Stream, upstream: Stream, cycle_s: float) -> bool:
     """Whether vehicles wait for a gap at the foremost line, and for green at the one before."""
-    at_gap, at_green = _queue_heads(stream), _queue_heads(upstream)
+    at_gap, at_green = (_first_after_red(_queue_heads(one), cycle_s) for one in (stream, upstream))
     if len(at_green) < MIN_STARTS or abs(np.exp(2j * np.pi * at_green / cycle_s).mean()) < _MIN_CONCENTRATION:
         return False
     return len(at_gap) < MIN_STARTS or not start_together(at_gap, at_green, cycle_s)
