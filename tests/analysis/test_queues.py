@@ -1,11 +1,12 @@
 """Queues of vehicles that are hidden, long, or still there when the film ends: their intervals hold the truth."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.analysis.test_traffic_analysis import CYCLE_S, SOUTH, Track, crossroads, drive, gather
+from tests.analysis.test_traffic_analysis import CYCLE_S, EAST, SOUTH, Track, crossroads, drive, gather
 from velfield.analysis.answers import find_answers
 from velfield.analysis.changes import find_changes
 from velfield.analysis.signals.cycles import StreamSignal, least_green_s, queues
@@ -94,6 +95,22 @@ def test_a_green_lasts_at_least_as_long_as_queues_drive_off() -> None:
     assert least_green_s([replace(found, stream=replace(found.stream, cross_time_s=np.sort(late)))], CYCLE_S) == least
     alone = replace(found, stream=replace(found.stream, cross_time_s=found.green_s + 20.0))
     assert least_green_s([alone], CYCLE_S) == 0.0
+
+
+def test_the_green_of_a_lane_that_ends_before_the_others_of_its_phase_is_said() -> None:
+    """On a second lane from the west two go at green, and nobody later; on the first one comes 19 s after green."""
+    beside = [
+        drive(EAST - [0.0, 3.5], CYCLE_S * n - 24 + 3 * k, stop_at_m=128.0 - 7 * k, go_s=CYCLE_S * n + 1.8 + 1.8 * k)
+        for n in range(12)
+        for k in range(2)
+    ]
+    late = [drive(EAST, CYCLE_S * n + 8.5) for n in range(12)]
+    analysis = TrafficAnalysis(gather(crossroads() + beside + late))
+    (said,) = [answer.text for answer in find_answers(analysis) if answer.topic == "signal"]
+    assert re.search(
+        r"from W, straight on and right \(lanes 0, (\d)\): green and yellow for (19|20|21) s, on lane \1 for [5-8] s;",
+        said,
+    )
 
 
 def test_where_some_are_hidden_others_may_be_behind_the_last() -> None:

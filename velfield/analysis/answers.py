@@ -23,7 +23,7 @@ from velfield.analysis.flow.speeds import FreeFlow
 from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.movements.movements import MIN_DELAY_S, MIN_DELAYED, JunctionMovements
-from velfield.analysis.signals.cycles import JunctionSignal, green_duration_s, least_green_s
+from velfield.analysis.signals.cycles import JunctionSignal, StreamSignal, green_duration_s, least_green_s
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import MOVES_M, Trajectories
 from velfield.analysis.unusual import Unusual
@@ -33,6 +33,8 @@ from velfield.errors import count_text, list_text
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
+_EMPTY_S = 8.0
+"""In the last so long of its green nobody may come by a lane of few vehicles."""
 _AT_JUNCTION_M, _ON_LANE_M, _ROAD_M = 20.0, 10.0, 50.0
 _NAMED, _SIGNS = 3, 2
 """Unusual tracks that a line names; of more speed limits than two the line names none."""
@@ -237,6 +239,7 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
         lasts, least = green_duration_s(streams, cycle.value), least_green_s(streams, cycle.value)
         long = f" and yellow for {lasts:.0f} s" if lasts else f" and yellow for {least:.0f} s or more" if least else ""
+        long += _shorter_greens(streams, cycle.value)
         begins_s = streams[0].green_phase_s.value
         first_s = begins_s if first_s is None else first_s
         later_s = (begins_s - first_s) % cycle.value
@@ -264,6 +267,22 @@ def no_cycle_text(signal: JunctionSignal) -> str:
         f"no signal was found: vehicles start at any time, {starts[1]} queues in no fixed cycle (an actuated signal "
         "has none either)"
     )
+
+
+def _shorter_greens(streams: Sequence[StreamSignal], cycle_s: float) -> str:
+    """The lanes of a phase whose green is seen to end before that of the others: ``, on lane 7 for 17 s``."""
+    lasts = {
+        s.stream.approach.lane: (
+            (red.value - s.green_phase_s.value) % cycle_s,
+            red.value - red.low,
+            red.high - red.value,
+        )
+        for s in streams
+        if (red := s.red_phase_s)
+    }
+    longest = max((value - below for value, below, _ in lasts.values()), default=0.0) - _EMPTY_S
+    short = {lane: value for lane, (value, _, above) in sorted(lasts.items()) if value + above < longest}
+    return "".join(f", on {lanes_text([lane])} for {value:.0f} s" for lane, value in short.items())
 
 
 def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:

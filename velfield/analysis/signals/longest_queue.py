@@ -47,15 +47,16 @@ def _stops(stream: Stream) -> set[tuple[int, float]]:
 
 def _longest_queue(stream: Stream) -> Queue | None:
     """The queue in which most vehicles were seen to stand at once; None: nobody stood at the stop line."""
-    best = None
+    best, least = None, 0.0
     times, standing = _fullest(stream)
     for k in np.argsort(-standing, kind="stable"):
-        if best and standing[k] <= best.vehicles.n:
+        if standing[k] <= least:
             break  # no queue has more vehicles than stand on the approach
         for queue in queues(stream, times[k : k + 1]):
             if queue.vehicles.n and (best is None or queue.vehicles.n > best.vehicles.n):
                 best = queue
-    return best
+            least = max(least, queue.vehicles.low)
+    return best and replace(best, vehicles=replace(best.vehicles, low=min(least, best.vehicles.value)))
 
 
 def _fullest(stream: Stream) -> tuple[FloatArray, IntArray]:
