@@ -481,12 +481,12 @@ def test_a_vehicle_that_leaves_its_lane_and_comes_back_is_not_on_it_between() ->
 
 
 def test_a_vehicle_beside_the_lane_of_a_gate_does_not_cross_there() -> None:
-    gates = Gates(
-        (Gate(0, True, np.array([10.0, 5.0]), np.pi / 2, 0),), (Arm(0, "N", np.array([10.0, 5.0]), -np.pi / 2),)
-    )
+    middle, road = np.array([10.0, 5.0]), np.array([10.0, -15.0])
+    gates = Gates((Gate(0, True, middle, np.pi / 2, 0),), (Arm(0, "N", middle, -np.pi / 2),), road[None])
     at = np.array([[10.0, 5.5], [12.0, 5.0], [13.5, 5.0], [10.0, 12.0]])
-    assert gates.nearest(at, np.full(4, np.pi / 2), inwards=True).tolist() == [0, 0, -1, -1]
-    assert gates.nearest(at, np.full(4, -np.pi / 2), inwards=True).tolist() == [-1] * 4
+    before = at - [0.0, 20.0]
+    assert gates.nearest(at, np.full(4, np.pi / 2), before, inwards=True).tolist() == [0, 0, -1, -1]
+    assert gates.nearest(at, np.full(4, -np.pi / 2), before, inwards=True).tolist() == [-1] * 4
 
 
 def test_queues_behind_a_signal_are_no_conflicts(analysis: TrafficAnalysis) -> None:

@@ -36,12 +36,7 @@ def named(analysis: TrafficAnalysis, name: str) -> Diagram:
     return next(d for d in traffic_diagrams(analysis, None) if d.name.startswith(name))
 
 
-_MERGED = pytest.mark.xfail(
-    strict=False, reason="roads that part at a junction's border may be one arm (6 of 42 grids)"
-)
-
-
-@pytest.mark.parametrize("turned_deg", [0.0, 20.0, pytest.param(-20.0, marks=_MERGED)])
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0, -20.0])
 def test_arms_of_a_turning_diagram_lie_where_their_roads_lead(turned_deg: float) -> None:
     """Gates are metres from the junction's centre: the direction to that of the north was 41 degrees off."""
     axes = drawn(named(turning_crossroads(turned_deg), "turning"))

@@ -124,18 +124,22 @@ class Gates:
 
     gates: tuple[Gate, ...]
     arms: tuple[Arm, ...]
+    roads_m: FloatArray
+    """(n, 2) position of the lane of each gate, `ROAD_M` outside the junction."""
 
     @property
     def arms_in(self) -> dict[int, str]:
         """Names of the arms by which the lanes lead in, by lane."""
         return {gate.lane: self.arms[gate.arm].name for gate in self.gates if gate.inwards}
 
-    def nearest(self, xy_m: FloatArray, direction_rad: FloatArray, *, inwards: bool) -> IntArray:
+    def nearest(self, xy_m: FloatArray, direction_rad: FloatArray, road_xy_m: FloatArray, *, inwards: bool) -> IntArray:
         """Number of the gate (n,) nearest to each crossing of its direction, -1: none near.
 
-        The lane beside a gate's may touch the area of the junction, and have no gate: its vehicles are no gate's.
+        The lane beside a gate's may touch the area of the junction, and have no gate: its vehicles are no gate's. Where
+        roads part at the border, gates are near each other: ``road_xy_m`` (n, 2), where the vehicle is `ROAD_M`
+        outside, tells them apart.
         """
-        return self._best(xy_m, direction_rad, inwards, _ASIDE_M, _REACH_M)
+        return self._best(xy_m, direction_rad, inwards, _ASIDE_M, _REACH_M, road_xy_m)
 
     def of_road(self, xy_m: FloatArray, direction_rad: FloatArray, *, inwards: bool) -> IntArray:
         """Number of a gate (n,) of the road that vehicles are on `ROAD_M` before a junction, or behind it; -1: none.
@@ -145,7 +149,13 @@ class Gates:
         return self._best(xy_m, direction_rad, inwards, _BESIDE_M, ROAD_M + _ARM_M)
 
     def _best(
-        self, xy_m: FloatArray, direction_rad: FloatArray, inwards: bool, aside_m: float, reach_m: float
+        self,
+        xy_m: FloatArray,
+        direction_rad: FloatArray,
+        inwards: bool,
+        aside_m: float,
+        reach_m: float,
+        road_xy_m: FloatArray | None = None,
     ) -> IntArray:
         """Number of the nearest gate (n,) of like direction that is less than so far away, and to the side."""
         rows = [k for k, gate in enumerate(self.gates) if gate.inwards == inwards]
@@ -156,10 +166,11 @@ class Gates:
         dx, dy = (xy_m[:, None] - at[None]).transpose(2, 0, 1)
         distance, aside = np.hypot(dx, dy), np.abs(dy * np.cos(heading) - dx * np.sin(heading))
         turn = np.abs(np.angle(np.exp(1j * (direction_rad[:, None] - heading[None]))))
-        distance = np.where((turn < _ARM_RAD) & (aside < aside_m), distance, np.inf)
+        distance = np.where((turn < _ARM_RAD) & (aside < aside_m) & (distance < reach_m), distance, np.inf)
+        if road_xy_m is not None:
+            distance = distance + np.hypot(*(road_xy_m[:, None] - self.roads_m[rows][None]).transpose(2, 0, 1))
         best = distance.argmin(axis=1)
-        near = distance[np.arange(len(xy_m)), best] < reach_m
-        return np.where(near, np.array(rows)[best], -1)
+        return np.where(np.isfinite(distance.min(axis=1)), np.array(rows)[best], -1)
 
 
 def find_gates(graph: LaneGraph, junction: Junction, names: ArmNames | None = None) -> Gates:
@@ -189,7 +200,8 @@ def find_gates(graph: LaneGraph, junction: Junction, names: ArmNames | None = No
         {i: middles[k] for i, k in enumerate(order)},
         place=f"{junction.number}.",
     )
-    return Gates(gates, tuple(Arm(i, name[i], middles[k], outward[k]) for i, k in enumerate(order)))
+    made = tuple(Arm(i, name[i], middles[k], outward[k]) for i, k in enumerate(order))
+    return Gates(gates, made, np.array([road[2] for road in roads]).reshape(-1, 2))
 
 
 def _middle(xy_m: FloatArray, k: int) -> tuple[FloatArray, float]:
@@ -209,17 +221,23 @@ def group_gates(*places: list[End]) -> IntArray:
     Parameters
     ----------
     places
-        Of each gate. Of several such lists gates are of one arm that are near each other in one of them.
+        Of each gate, farther and farther out. Gates are of one arm that are near each other in one of these lists, and
+        of one axis in the last: roads that part at the border lead elsewhere.
     """
     n = len(places[0])
     label = np.arange(n)
     for i in range(n):
         for j in range(i):
-            if any(_of_one_road(found[i], found[j]) for found in places):
+            near = any(_of_one_road(found[i], found[j]) for found in places)
+            if near and _between(places[-1][i], places[-1][j]) < _ARM_RAD:
                 label[label == label[i]] = label[j]
     return label
 
 
 def _of_one_road(a: End, b: End) -> bool:
-    turn = abs(float(np.angle(np.exp(1j * (a[3] + np.pi * a[1] - b[3] - np.pi * b[1])))))
-    return bool(np.hypot(*(a[2] - b[2])) < _ARM_M and turn < _ARM_RAD)
+    return bool(np.hypot(*(a[2] - b[2])) < _ARM_M and _between(a, b) < _ARM_RAD)
+
+
+def _between(a: End, b: End) -> float:
+    """Angle between the directions in which two gates lead outwards, rad."""
+    return abs(float(np.angle(np.exp(1j * (a[3] + np.pi * a[1] - b[3] - np.pi * b[1])))))

@@ -218,10 +218,16 @@ def _passes(samples: PathSamples, inside: IntArray, gates: Gates, waits: IntArra
     enters = (first > 0) & (samples.track[np.maximum(first - 1, 0)] == samples.track[first])
     after = np.minimum(last + 1, len(samples) - 1)
     leaves = (last + 1 < len(samples)) & (samples.track[after] == samples.track[last])
-    gate_in = np.where(enters, gates.nearest(samples.xy_m[first], samples.direction_rad[first], inwards=True), -1)
-    gate_out = np.where(leaves, gates.nearest(samples.xy_m[last], samples.direction_rad[last], inwards=False), -1)
     before = np.maximum(first - ROAD_M, np.searchsorted(samples.track, samples.track[first]))
     behind = np.minimum(last + ROAD_M, np.searchsorted(samples.track, samples.track[last], side="right") - 1)
+    gate_in, gate_out = (
+        np.where(
+            crosses,
+            gates.nearest(samples.xy_m[at], samples.direction_rad[at], samples.xy_m[outside], inwards=inwards),
+            -1,
+        )
+        for crosses, at, outside, inwards in ((enters, first, before, True), (leaves, last, behind, False))
+    )
     turned = np.angle(np.exp(1j * (samples.direction_rad[behind] - samples.direction_rad[before])))
     # who passes beside all gates, straight on, may be on a lane that is none of the junction's
     of_junction = (gate_in >= 0) | (gate_out >= 0) | (np.abs(turned) > _TURN_RAD)
