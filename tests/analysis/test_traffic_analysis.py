@@ -11,6 +11,7 @@ from velfield.analysis.answers import find_answers
 from velfield.analysis.approaches import lanes_text
 from velfield.analysis.changes import find_changes
 from velfield.analysis.flow.conflicts import find_conflicts, persistent, positions_on_lanes
+from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.flow.speeds import FreeFlow
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.intervals import (
@@ -667,6 +668,18 @@ def test_lanes_that_meet_at_the_edge_of_the_view_do_not_merge(together_m: float,
     analysis = TrafficAnalysis(gather(tracks + [drive(beside, 9.0 * k + 0.5) for k in range(9)]))
     assert any(len(analysis.lanes.predecessors[lane.number]) == 2 for lane in analysis.lanes)
     assert any(c.kind == "merging" for c in analysis.conflicts) == found
+
+
+def test_vehicles_side_by_side_on_what_errors_made_one_lane_do_not_merge() -> None:
+    joins = np.array([[0.0, 3.6], [128.5, 3.6], [130.0, 0.3], [150.0, 0.1]])
+    tracks = [drive(np.array([[0.0, 0.0], [150.0, 0.0]]), 9.0 * k) for k in range(9)]
+    analysis = TrafficAnalysis(gather(tracks + [drive(joins, 9.0 * k + 0.5) for k in range(9)]))
+    samples = analysis.lanes.samples
+    offset_m = np.where(samples.track == 13, 3.4, samples.offset_m)  # beside track 4
+    graph = replace(analysis.lanes, samples=replace(samples, offset_m=offset_m))
+    found = find_conflicts(analysis.trajectories, LaneTraffic(graph))
+    merging = {(c.first, c.second) for c in found if c.kind == "merging" and c.likely}
+    assert merging == {(k, k + 9) for k in range(9) if k != 4}
 
 
 def in_two_clips(

@@ -177,7 +177,8 @@ def _post_encroachments(
     a = traffic.passings(crossing.lane, crossing.along_m)
     b = traffic.passings(crossing.other, crossing.other_along_m)
     half_m = VEHICLE_WIDTH_M / 2 / max(abs(np.sin(crossing.angle_rad)), 0.3)
-    both = Passings(np.r_[a.track, b.track], np.r_[a.time_s, b.time_s], np.r_[a.speed_m_per_s, b.speed_m_per_s])
+    track, time, speed = (np.r_[getattr(a, k), getattr(b, k)] for k in ("track", "time_s", "speed_m_per_s"))
+    both = Passings(track, time, speed, np.zeros(len(track)))  # of two lanes there is no common centre line
     stream = np.repeat([0, 1], [len(a), len(b)])
     return _pairs("crossing", both, stream, crossing.xy_m, lengths, half_m, threshold_s, sd_m)
 
@@ -201,7 +202,7 @@ def _merges(
         source = _sources(vehicle[at.track], [vehicle[traffic.samples(k).track] for k in sources])
         known = source >= 0
         source = _apart([graph.lanes[k].xy_m for k in sources], _APART_M + 3 * sd_m)[source]
-        at = Passings(at.track[known], at.time_s[known], at.speed_m_per_s[known])
+        at = Passings(at.track[known], at.time_s[known], at.speed_m_per_s[known], at.offset_m[known])
         out += _pairs("merging", at, source[known], lane.at(place), lengths, 0.0, threshold_s, sd_m)
     return out
 
@@ -237,12 +238,14 @@ def _pairs(
     """Consecutive passings of different streams (n,), nearer than ``MAX_PET_S``."""
     order = np.argsort(at.time_s, kind="stable")
     track, time, stream = at.track[order], at.time_s[order], stream[order]
-    speed = np.maximum(at.speed_m_per_s[order], _MIN_SPEED_M_PER_S)
+    speed, offset = np.maximum(at.speed_m_per_s[order], _MIN_SPEED_M_PER_S), at.offset_m[order]
     k = np.flatnonzero((np.diff(stream) != 0) & (np.diff(time) < MAX_PET_S + 3.0) & (np.diff(track) != 0))
     reach = lengths[track] / 2 + half_m
     value = (time[k + 1] - reach[k + 1] / speed[k + 1]) - (time[k] + reach[k] / speed[k])
     sd = sd_m * np.hypot(1 / speed[k], 1 / speed[k + 1])
     probability = special.ndtr((threshold_s - value) / sd)
+    if kind == "merging":  # and that they are not beside each other: errors may make one lane of two
+        probability *= special.ndtr((VEHICLE_WIDTH_M - np.abs(offset[k + 1] - offset[k])) / (np.sqrt(2) * sd_m))
     return [
         Conflict(
             kind, int(track[i]), int(track[i + 1]), float(time[i + 1]), xy_m, float(v), float(s), threshold_s, float(p)

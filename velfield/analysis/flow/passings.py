@@ -15,11 +15,13 @@ _GOES_S = 1.5
 
 @dataclass(frozen=True)
 class Passings:
-    """Tracks at a place: ``track``, ``time_s``, ``speed_m_per_s`` (n,), in time order."""
+    """Tracks at a place: ``track``, ``time_s``, ``speed_m_per_s`` and ``offset_m``, to the right of the lane's centre
+    line, (n,) each, in time order."""
 
     track: IntArray
     time_s: FloatArray
     speed_m_per_s: FloatArray
+    offset_m: FloatArray
 
     def __len__(self) -> int:
         return len(self.track)
@@ -66,4 +68,4 @@ def find_passings(samples: LaneSamples, along_m: float) -> Passings:
     time = samples.time_s[step + 1] - (1 - f) * lasts
     speed = samples.speed_m_per_s[step] + f * (samples.speed_m_per_s[step + 1] - samples.speed_m_per_s[step])
     order = np.argsort(time, kind="stable")
-    return Passings(samples.track[step][order], time[order], speed[order])
+    return Passings(samples.track[step][order], time[order], speed[order], samples.offset_m[step][order])
