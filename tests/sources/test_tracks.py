@@ -310,3 +310,13 @@ def test_rows_that_descend_in_time_are_reported(tmp_path: Path, by_time: bool) -
         one.to_csv(tmp_path / "t.csv", index=False)
         found = [note for note in load(tmp_path / "t.csv", {}).notes if "descending order of time" in note]
         assert [note.startswith("warning: the rows of 8 of 8 tracks") for note in found] == [True] * reported
+
+
+@pytest.mark.parametrize(("y_axis", "way"), [(None, 1.0), ("down", 1.0), ("up", -1.0)])
+def test_metres_of_no_format_point_down_or_as_is_said(tmp_path: Path, y_axis: str | None, way: float) -> None:
+    rows = [(k, 0.2 * t, 10.0 * k, 2.0 * t) for k in range(4) for t in range(30)]
+    pd.DataFrame(rows, columns=["id", "time_s", "x_m", "y_m"]).to_csv(tmp_path / "t.csv", index=False)
+    loaded = load(tmp_path / "t.csv", {"y_axis": y_axis})
+    one = loaded.table.query("track_id == track_id.min()").sort_values("time_s")
+    assert (one["y_px"].iloc[-1] - one["y_px"].iloc[0]) * loaded.gsd_m == pytest.approx(way * 58.0, abs=1.0)
+    assert ("taken so; --y-axis up where it points up" in " ".join(loaded.notes)) == (y_axis is None)

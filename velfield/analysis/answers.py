@@ -137,7 +137,7 @@ def _place(analysis: TrafficAnalysis, junction: int) -> str:
 
 def _classes(analysis: TrafficAnalysis) -> Answer:
     if analysis.classes is None or not len(analysis.classes.measured):
-        text = "too little data: lengths and widths in metres are not known of these tracks"
+        text = "too little data: classes need lengths and widths in metres, which are not both known of these tracks"
         return Answer("classes", "", "too little data", text)
     shares = analysis.classes.estimate_shares(analysis.classes.measured)
     known = [(name, share) for name, share in zip(COUNTED_CLASSES, shares, strict=True) if share is not None]
@@ -167,10 +167,8 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
         if not r.seen:
             continue  # the table has what is inferred alone
         share = _share_text(r.share, r.origin.name)
-        text = (
-            f"{count_text(r.vehicles, 'vehicle')} from edge to edge of the view, {r.seen} of them tracked all the way"
-        )
-        text += share
+        rest = ", the others in part" if r.seen < round(r.vehicles) else ""
+        text = f"{count_text(r.vehicles, 'vehicle')}{share}; {r.seen} of them seen from edge to edge of the view{rest}"
         yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
 
 

@@ -273,14 +273,18 @@ def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("lost", "Start-up lost time", "s", lambda row: row[1].start_up_lost_s),
         estimates("saturation", "Saturation flow", "veh/h", lambda row: row[1].saturation_veh_per_h),
         Column("queue", "Queue at green", "veh", lambda row: _mean([q.vehicles.value for q in row[2]]), 1),
-        estimates("queue_max", "Longest queue", "veh", lambda row: _longest(row[2]).vehicles if row[2] else None),
-        Column("queue_max_m", "Longest queue", "m", lambda row: _longest(row[2]).length_m if row[2] else None, 1),
+        estimates(
+            "queue_max", "Longest queue at green", "veh", lambda row: _longest(row[2]).vehicles if row[2] else None
+        ),
+        Column(
+            "queue_max_m", "Longest queue at green", "m", lambda row: _longest(row[2]).length_m if row[2] else None, 1
+        ),
         Column("queue_open", "Queues that end out of view", "", lambda row: sum(q.reaches_edge for q in row[2])),
         estimates("stops", "Vehicles that stop", "%", lambda row: stopping_share(row[1].stream), 100.0),
     ]
     note = (
         "Second 0 of the cycle is the first frame of the flight. A vehicle is taken to start "
-        f"{START_DELAY_S:.1f} s after its green."
+        f"{START_DELAY_S:.1f} s after its green. A queue that ends out of view is longer than it says."
     )
 
     def place(row: tuple[int, StreamSignal, list[Queue]]) -> FloatArray:

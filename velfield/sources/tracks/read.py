@@ -145,7 +145,8 @@ class _Reader:
         point = "centre" if self.form is None else self.form.point
         names = f"{self.columns[position.x]}, {self.columns[position.y]}"
         of = {"centre": "", "front": ", of the vehicle's front", "corner": ", corner of a box"}[point]
-        what = f"{self.path.name}: {named}; {names} in {unit}, y {axis}{of}; times: {times_note}; "
+        taken = " (taken so; --y-axis up where it points up)" if self._is_plain(position) and not self.y_axis else ""
+        what = f"{self.path.name}: {named}; {names} in {unit}, y {axis}{taken}{of}; times: {times_note}; "
         what += f"{table['track_id'].nunique()} vehicles"
         kind = "px" if unit == "px" else "m"
         north = position.y_is_north and axis == "up"
@@ -187,7 +188,7 @@ class _Reader:
     def _axis(self, position: Position) -> YAxis:
         unit = self._unit(position)
         usual: YAxis | None = {"px": "down", "deg": "up"}.get(unit)  # type: ignore[assignment]
-        axis = position.y_axis or self.y_axis or usual
+        axis = (self.y_axis if self._is_plain(position) else None) or position.y_axis or self.y_axis or usual
         if axis is None:
             raise InputError(
                 f"{self.path}: found columns {self.columns[position.x]} and {self.columns[position.y]} in {unit}, "
@@ -196,6 +197,10 @@ class _Reader:
         if self.y_axis is not None and axis != self.y_axis:
             raise InputError(f"{self.path}: found --y-axis {self.y_axis}, expected {axis}, as in this format; omit it")
         return axis
+
+    def _is_plain(self, position: Position) -> bool:
+        """Whether it is x_m and y_m of no format: ours points down, as images do, others' may point up."""
+        return self.form is None and (position.x, position.y) == ("xm", "ym")
 
     def _in_degrees(self, position: Position, x: FloatArray, y: FloatArray) -> Position:
         """The position in degrees where a format that has metres or degrees (SUMO) has degrees."""
