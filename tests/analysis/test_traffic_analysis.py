@@ -670,6 +670,14 @@ def test_lanes_that_meet_at_the_edge_of_the_view_do_not_merge(together_m: float,
     assert any(c.kind == "merging" for c in analysis.conflicts) == found
 
 
+@pytest.mark.parametrize(("stopping", "said"), [(0, False), (1, False), (6, True)])
+def test_a_mean_speed_tells_of_stops_where_vehicles_stop(stopping: int, said: bool) -> None:
+    halt = {k: {"stop_at_m": 120.0, "go_s": 12.0 * k + 20.0} if k < stopping else {} for k in range(25)}
+    analysis = TrafficAnalysis(gather([drive(EAST, 12.0 * k, **halt[k]) for k in range(25)]))
+    (answer,) = (one for one in find_answers(analysis) if one.topic == "mean speed")
+    assert ("stops and queues included" in answer.text) == said
+
+
 def test_vehicles_side_by_side_on_what_errors_made_one_lane_do_not_merge() -> None:
     joins = np.array([[0.0, 3.6], [128.5, 3.6], [130.0, 0.3], [150.0, 0.1]])
     tracks = [drive(np.array([[0.0, 0.0], [150.0, 0.0]]), 9.0 * k) for k in range(9)]

@@ -36,6 +36,8 @@ _SHORT_S, _FEW_TRACKS, _FEW_EVENTS = 60.0, 30, 3
 _EMPTY_S = 8.0
 """In the last so long of its green nobody may come by a lane of few vehicles."""
 _AT_JUNCTION_M, _ON_LANE_M, _ROAD_M = 20.0, 10.0, 50.0
+_FEW_STOP = 0.05
+"""Of the vehicles on a lane: where no more than these stop, its mean speed is that of vehicles that drive."""
 _NAMED, _SIGNS = 3, 2
 """Unusual tracks that a line names; of more speed limits than two the line names none."""
 COVERED = "on ways that three vehicles or more drive"
@@ -213,9 +215,10 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
         yield Answer("speed", lanes_text(long), "too little data", text)
     means = [(flow.lane, mean) for flow in analysis.flows if (mean := flow.space_mean_speed_m_per_s)]
     for lane, mean in sorted(means, key=lambda pair: -pair[1].n):
-        slowest = analysis.lane_traffic.samples(lane).speed_m_per_s.min()
+        samples = analysis.lane_traffic.samples(lane)
+        stopped = len(np.unique(samples.track[samples.speed_m_per_s < STATIONARY_SPEED_M_PER_S]))
         text = f"mean {estimate_text(mean, unit, PER_M_PER_S[unit])}"
-        text += ", stops and queues included" if slowest < STATIONARY_SPEED_M_PER_S else ""
+        text += ", stops and queues included" if stopped > _FEW_STOP * mean.n else ""
         yield Answer("mean speed", f"lane {lane}", "found", text, mean.in_units(PER_M_PER_S[unit]), unit)
 
 
