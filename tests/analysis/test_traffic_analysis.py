@@ -265,7 +265,13 @@ def test_without_a_cycle_there_is_no_signal(analysis: TrafficAnalysis) -> None:
     streams = next(s for s in analysis.streams.values() if any(len(x.head_time_s) for x in s))
     rng = np.random.default_rng(0)
     scattered = [replace(s, head_time_s=np.sort(rng.uniform(0, 480, len(s.head_time_s)))) for s in streams]
-    assert find_signal(0, scattered, np.array([[0.0, 480.0]])).signalised is False
+    found = find_signal(0, scattered, np.array([[0.0, 480.0]]))
+    assert found.signalised is False
+    assert re.fullmatch(
+        r"no signal was found: vehicles start at any time, \d+ queues in no fixed cycle \(an actuated signal has none "
+        r"either\)",
+        found.reason,
+    )
     few = [replace(s, head_time_s=s.head_time_s[:1]) for s in streams]
     assert find_signal(0, few, np.array([[0.0, 480.0]])).signalised is None
 

@@ -1,6 +1,5 @@
 """Answers for people: a number with its interval, none and at most so many an hour, or what is missing for one."""
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -232,7 +231,7 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     subject = f"junction {signal.junction}"
     if not signal.signalised or signal.cycle_s is None:
         state: State = "too little data" if signal.signalised is None else "none"
-        return Answer("signal", subject, state, no_cycle_text(signal))
+        return Answer("signal", subject, state, signal.reason)
     cycle = signal.cycle_s
     text = f"cycle {cycle.value:.1f} s ({cycle.low:.1f} to {cycle.high:.1f}), {count_text(len(signal.phases), 'phase')}"
     first_s = None
@@ -251,23 +250,6 @@ def _signal(analysis: TrafficAnalysis, signal: JunctionSignal) -> Answer:
     if unknown := sorted({*stop} - known):
         text += f"; {_from_arms(analysis, signal.junction, unknown)}green not known: too few are seen to start with it"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
-
-
-def no_cycle_text(signal: JunctionSignal) -> str:
-    """Why no cycle of a junction is known, for people.
-
-    Examples
-    --------
-    >>> no_cycle_text(JunctionSignal(0, False, "no fixed cycle: 50 starts of queues, concentration 0.28", None, (), ()))
-    'no signal was found: vehicles start at any time, 50 queues in no fixed cycle (an actuated signal has none either)'
-    """
-    starts = re.fullmatch(r"no fixed cycle: (\d+) starts of queues.*", signal.reason)
-    if starts is None:
-        return signal.reason
-    return (
-        f"no signal was found: vehicles start at any time, {starts[1]} queues in no fixed cycle (an actuated signal "
-        "has none either)"
-    )
 
 
 def _shorter_greens(streams: Sequence[StreamSignal], cycle_s: float) -> str:
@@ -312,19 +294,18 @@ def _delays(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Ans
 
 def _queues(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Answer]:
     """The longest queue of each arm; the lanes whose queue is not known."""
-    number = found.junction.number
+    number, subject = found.junction.number, f"junction {found.junction.number}"
     if analysis.ways_meet(number) and number not in analysis.lane_queues:
         text = "too little data: queues are measured before a signal whose cycle is known"
-        yield Answer("queue", f"junction {number}", "too little data", text)
+        yield Answer("queue", subject, "too little data", text)
     for arm, longest in longest_queues(analysis, found).items():
         text = f"longest, {lane_text(found, longest.lane)}: {longest.text}"
-        subject = f"junction {found.junction.number} from {arm}"
-        yield Answer("queue", subject, "found", text, longest.vehicles, "vehicles")
+        yield Answer("queue", f"{subject} from {arm}", "found", text, longest.vehicles, "vehicles")
     for arm, lanes in lanes_without_queue(analysis, found).items():
         text = (
             f"too little data: vehicles stand on {lanes_text(lanes)}, but hardly one is seen to stand at the stop line"
         )
-        yield Answer("queue", f"junction {found.junction.number} from {arm}", "too little data", text)
+        yield Answer("queue", f"{subject} from {arm}", "too little data", text)
 
 
 def _from_arms(analysis: TrafficAnalysis, junction: int, lanes: Sequence[int]) -> str:

@@ -133,11 +133,13 @@ def find_signal(
             f"too little data: starts of queues may recur every {cycle:.0f} s, of which {duration:.0f} s hold no two"
         )
         return JunctionSignal(junction, None, reason, None, (), ())
-    events = [_first_after_red(times, cycle) for times in events]
-    concentration = float(_concentration(np.array([1 / cycle]), events)[0])
+    events, concentration = _recurring(events, cycle)
     if p_value > _MAX_P_VALUE or concentration < _MIN_CONCENTRATION:
         if n >= _NO_CYCLE_STARTS and duration >= _NO_CYCLE_S:
-            reason = f"no fixed cycle: {n} starts of queues, concentration {concentration:.2f}"
+            reason = (
+                f"no signal was found: vehicles start at any time, {n} queues in no fixed cycle (an actuated signal "
+                "has none either)"
+            )
             return JunctionSignal(junction, False, reason, None, (), ())
         reason = (
             f"too little data: {n} starts of queues in {duration:.0f} s do not tell a cycle from chance "
@@ -211,14 +213,19 @@ def _at_stop_lines(streams: Sequence[Stream], observed_s: FloatArray) -> list[St
         fit = _fit_period(events, min(MAX_CYCLE_S, duration)) if events and duration > 2 * MIN_CYCLE_S else None
         if fit is None:
             continue
-        events = [_first_after_red(times, fit[0]) for times in events]
-        concentration = float(_concentration(np.array([1 / fit[0]]), events)[0])
+        events, concentration = _recurring(events, fit[0])
         recur = concentration * sum(map(len, events))  # so many starts do
         if concentration >= _MIN_CONCENTRATION and recur > best:
             cycle_s, best = fit[0], recur
     if not best:
         return list(streams)
     return [upstream if _waits_beyond(stream, upstream, cycle_s) else stream for stream, upstream in every]
+
+
+def _recurring(events: Sequence[FloatArray], cycle_s: float) -> tuple[list[FloatArray], float]:
+    """The first start of each stream in each cycle, and their concentration."""
+    first = [_first_after_red(times, cycle_s) for times in events]
+    return first, float(_concentration(np.array([1 / cycle_s]), first)[0])
 
 
 def _first_after_red(times_s: FloatArray, cycle_s: float) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 from schemas.analysis import AnalysisTable
 from schemas.arrays import FloatArray
 from schemas.export import SpeedUnit
-from velfield.analysis.answers import TWO_LEVELS, no_cycle_text, speed_limits
+from velfield.analysis.answers import TWO_LEVELS, speed_limits
 from velfield.analysis.approaches import ApproachDelay, ArmQueue, approach_delays, longest_queues
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
@@ -241,7 +241,7 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     def said(signal: JunctionSignal) -> str:
         if analysis.junction_kind(signal.junction) == "crossing":
             return TWO_LEVELS
-        reason = no_cycle_text(signal).removeprefix("too little data: ").removeprefix("no signal: ")
+        reason = signal.reason.removeprefix("too little data: ").removeprefix("no signal: ")
         return names[signal.signalised] + (f": {reason}" if reason else "")
 
     columns: list[Column[JunctionSignal]] = [
